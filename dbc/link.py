@@ -1,0 +1,74 @@
+"""The one way onto a CAN bus: python-can behind three calls that never raise on what the bus does.
+
+A bus is named as python-can names it, `INTERFACE:CHANNEL`: `socketcan:vcan0`, `xilgate:bus0`.
+"""
+
+import time
+from types import TracebackType
+from typing import Self
+
+import can
+
+from dbc.frame import CanFrame
+
+MAX_FRAMES_PER_RECEIVE = 512
+"""Bound on one call, so that a flood of frames cannot hold the caller's loop."""
+
+
+class LinkError(Exception):
+    """The bus cannot be opened; one line that says why."""
+
+
+class CanLink:
+    """A CAN bus that is polled, never waited for.
+
+    Frames carry the monotonic time of the poll that fetched them. Error and remote frames are counted and dropped.
+    """
+
+    def __init__(self, bus_name: str) -> None:
+        interface, separator, channel = bus_name.partition(":")
+        if not (separator and interface and channel):
+            raise LinkError(f"bus {bus_name!r}: expected INTERFACE:CHANNEL, for example socketcan:vcan0")
+        try:
+            self._bus = can.Bus(channel=channel, interface=interface)
+        except (can.CanError, OSError, ValueError, ImportError) as error:
+            raise LinkError(f"bus {bus_name!r} does not open: {error}") from error
+        self.name = bus_name
+        self.send_errors = 0
+        self.receive_errors = 0
+        self.ignored_frames = 0
+
+    def receive(self) -> list[CanFrame]:
+        """All frames that have arrived since the last call, oldest first."""
+        frames: list[CanFrame] = []
+        for _ in range(MAX_FRAMES_PER_RECEIVE):
+            try:
+                message = self._bus.recv(timeout=0)
+            except (can.CanError, OSError):
+                self.receive_errors += 1
+                break
+            if message is None:
+                break
+            if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+                self.ignored_frames += 1
+                continue
+            frames.append(CanFrame(message.arbitration_id, bytes(message.data), time.monotonic_ns()))
+        return frames
+
+    def send(self, frames: list[CanFrame]) -> None:
+        """Hand frames to the bus; what it refuses is counted and dropped, because a later frame supersedes it."""
+        for frame in frames:
+            try:
+                self._bus.send(can.Message(arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=False))
+            except (can.CanError, OSError):
+                self.send_errors += 1
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.shutdown()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

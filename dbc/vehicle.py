@@ -1,0 +1,178 @@
+"""The numbers of one car, read from one TOML file in which every number carries its source."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+FOCUS = Path(__file__).with_name("focus.toml")
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class VehicleError(Exception):
+    """A vehicle file cannot be used; one line per mistake, each with file and key."""
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Body(_Section):
+    """Outline of the car."""
+
+    length_m: Positive
+    width_m: Positive
+    front_overhang_m: NotNegative
+
+
+class Steering(_Section):
+    """Steering wheel to road wheel."""
+
+    ratio: Positive
+    road_wheel_limit_rad: Positive
+
+
+class Pedals(_Section):
+    """Calibration of the pedals as the gateway believes it."""
+
+    full_drive_force_n: Positive
+    full_brake_force_n: Positive
+
+
+class ModelParameters(_Section):
+    """Parameters of the controller's bicycle model: M, I_z, L_f, L_r, K_f, K_r, T_max, R, C_r0, C_r2 of the paper."""
+
+    mass_kg: Positive
+    yaw_inertia_kgm2: Positive
+    cog_to_front_m: Positive
+    cog_to_rear_m: Positive
+    front_cornering_stiffness_nprad: Positive
+    rear_cornering_stiffness_nprad: Positive
+    max_wheel_torque_nm: Positive
+    wheel_radius_m: Positive
+    rolling_resistance_n: NotNegative
+    air_drag_nps2pm2: NotNegative
+
+
+class PlantParameters(_Section):
+    """Parameters of the emulated car."""
+
+    mass_kg: Positive
+    yaw_inertia_kgm2: Positive
+    cog_to_front_m: Positive
+    cog_to_rear_m: Positive
+    cog_height_m: Positive
+    track_front_m: Positive
+    track_rear_m: Positive
+    roll_stiffness_front_share: Share
+    friction: Positive
+    tyre_cornering_stiffness_per_load: Positive
+    tyre_shape_c: Annotated[float, Field(ge=1.0, lt=2.0)]
+    tyre_load_sensitivity: NotNegative
+    tyre_nominal_load_n: Positive
+    relaxation_length_m: Positive
+    full_drive_force_n: Positive
+    drag_torque_force_n: NotNegative
+    full_brake_force_n: Positive
+    brake_front_share: Share
+    drive_lag_s: Positive
+    brake_lag_s: Positive
+    rolling_resistance_coefficient: NotNegative
+    drag_area_m2: NotNegative
+
+
+class SteeringRobot(_Section):
+    """Dynamics of the steering robot, at the steering wheel."""
+
+    bandwidth_hz: Positive
+    damping_ratio: Positive
+    dead_time_s: NotNegative
+    rate_limit_radps: Positive
+    range_rad: Positive
+
+
+class PedalRobot(_Section):
+    """Dynamics of a pedal robot; positions and rates are shares of the learned stroke."""
+
+    bandwidth_hz: Positive
+    damping_ratio: Positive
+    dead_time_s: NotNegative
+    rate_limit_per_s: Positive
+    stroke_m: Positive
+
+
+class Robots(_Section):
+    """The three driving robots."""
+
+    steering: SteeringRobot
+    accelerator: PedalRobot
+    brake: PedalRobot
+
+
+class InsParameters(_Section):
+    """Errors of the navigation system."""
+
+    latency_s: NotNegative
+    position_sigma_m: NotNegative
+    position_correlation_s: Positive
+    position_white_sigma_m: NotNegative
+    velocity_sigma_mps: NotNegative
+    heading_sigma_rad: NotNegative
+    heading_correlation_s: Positive
+    heading_white_sigma_rad: NotNegative
+    yaw_rate_sigma_radps: NotNegative
+    acceleration_sigma_mps2: NotNegative
+
+
+class Vehicle(_Section):
+    """One car: what it is, what the controller believes of it, and its instruments."""
+
+    name: str
+    body: Body
+    steering: Steering
+    pedals: Pedals
+    model: ModelParameters
+    plant: PlantParameters
+    robots: Robots
+    ins: InsParameters
+
+
+def load_vehicle(path: Path = FOCUS) -> Vehicle:
+    """Read a vehicle file.
+
+    Raises:
+        VehicleError: missing file, malformed TOML, number without source, unknown or missing key, value out of range.
+    """
+    try:
+        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise VehicleError(f"{path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise VehicleError(f"{path}: not valid TOML: {error}") from error
+    try:
+        return Vehicle.model_validate(_without_sources(tree, str(path), ""))
+    except ValidationError as error:
+        lines = (f"{path}: {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        raise VehicleError("\n".join(lines)) from error
+
+
+def _without_sources(tree: dict[str, Any], path: str, prefix: str) -> dict[str, Any]:
+    """Replace every `{ value, source }` by its value; a number on its own is refused."""
+    plain: dict[str, Any] = {}
+    for key, entry in tree.items():
+        name = f"{prefix}{key}"
+        if isinstance(entry, dict) and "value" in entry:
+            if set(entry) != {"value", "source"} or not str(entry["source"]).strip():
+                raise VehicleError(f"{path}: {name}: expected {{ value = ..., source = \"...\" }}")
+            plain[key] = entry["value"]
+        elif isinstance(entry, dict):
+            plain[key] = _without_sources(entry, path, f"{name}.")
+        elif isinstance(entry, str):
+            plain[key] = entry
+        else:
+            raise VehicleError(f"{path}: {name}: a number needs its source: {{ value = {entry}, source = \"...\" }}")
+    return plain

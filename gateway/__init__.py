@@ -1,0 +1,1 @@
+"""The vehicle interface: the only process that writes to the car's bus. It trusts nothing."""
