@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cantools
 from cantools.database.can.message import Message
+from cantools.database.can.signal import Signal
 from cantools.database.errors import Error as CantoolsError
 
 from dbc.e2e import COUNTER_START_BIT, CRC_START_BIT, PROFILE
@@ -77,10 +78,7 @@ class Catalogue:
         self.by_name[spec.name] = spec
         self.by_id[spec.arbitration_id] = spec
         self._messages[spec.name] = message
-        self._ranges[spec.name] = tuple(
-            (s.name, -math.inf if s.minimum is None else float(s.minimum), math.inf if s.maximum is None else float(s.maximum))
-            for s in message.signals
-        )
+        self._ranges[spec.name] = tuple(_range_of(s) for s in message.signals)
         # A database need not give start values: neutral is zero, or the nearest value the signal can take.
         self._start_values[spec.name] = {
             name: float(min(max(0.0, minimum), maximum)) for name, minimum, maximum in self._ranges[spec.name]
@@ -91,8 +89,12 @@ class Catalogue:
         return tuple(signal for signal, _, _ in self._ranges[name])
 
     def bounds(self, name: str, signal: str) -> tuple[float, float]:
-        """Smallest and largest physical value of a signal, in the unit of the DBC."""
-        return next((low, high) for s, low, high in self._ranges[name] if s == signal)
+        """Smallest and largest physical value of a signal, in the unit of the DBC; infinite where it states none."""
+        found = self._messages[name].get_signal_by_name(signal)
+        return (
+            -math.inf if found.minimum is None else float(found.minimum),
+            math.inf if found.maximum is None else float(found.maximum),
+        )
 
     def enumeration(self, name: str, signal: str) -> dict[str, int]:
         """Value table of a signal: entry name to raw value."""
@@ -151,6 +153,14 @@ def load(paths: Iterable[Path] = (ROBOTS_DBC, GNSS_IMU_DBC)) -> Catalogue:
         messages += database.messages  # type: ignore[union-attr]
         sha256[path.name] = hashlib.sha256(content).hexdigest()
     return Catalogue(messages, sha256)
+
+
+def _range_of(signal: Signal) -> tuple[str, float, float]:
+    """Name, smallest and largest value, half a bit wider than in the DBC: factors are decimal, floats are not."""
+    half_bit = 0.5 * abs(float(signal.scale))
+    low = -math.inf if signal.minimum is None else float(signal.minimum) - half_bit
+    high = math.inf if signal.maximum is None else float(signal.maximum) + half_bit
+    return signal.name, low, high
 
 
 def _spec_of(message: Message) -> MessageSpec:

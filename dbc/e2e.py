@@ -35,12 +35,13 @@ class E2EStatus(Enum):
 
 
 def data_id_list(data_id: int) -> bytes:
-    """The sixteen data ids of one message, one for each counter value.
+    """The sixteen data ids of one message, one for each counter value: the same for all of them.
 
-    Two messages whose `data_id` differ also differ at every counter value, so that a payload sent under another
-    message's identifier always fails the CRC.
+    A list that varies with the counter, as AUTOSAR allows, turns one wrong bit in the counter into a wrong data id as
+    well and so loses the guaranteed detection of two- and three-bit errors. A payload sent under another message's
+    identifier fails the CRC either way.
     """
-    return bytes((data_id + k) % 256 for k in range(COUNTER_MODULUS))
+    return bytes([data_id]) * COUNTER_MODULUS
 
 
 class E2EProtector:

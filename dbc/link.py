@@ -22,7 +22,21 @@ class LinkError(Exception):
 class CanLink:
     """A CAN bus that is polled, never waited for.
 
-    Frames carry the monotonic time of the poll that fetched them. Error and remote frames are counted and dropped.
+    Frames carry the monotonic time of the poll that fetched them. What is not a classical data frame with an 11-bit
+    identifier is counted and dropped.
+
+    Args:
+        bus_name: `INTERFACE:CHANNEL`.
+
+    Attributes:
+        is_alive: False from the first refusal of the bus until it next delivers or accepts a frame. It stays False when the
+            interface was removed or the hub has gone.
+        send_errors: frames that the bus refused.
+        receive_errors: polls that the bus refused.
+        ignored_frames: frames dropped because of their kind.
+
+    Raises:
+        LinkError: no such bus, or it does not open.
     """
 
     def __init__(self, bus_name: str) -> None:
@@ -30,29 +44,35 @@ class CanLink:
         if not (separator and interface and channel):
             raise LinkError(f"bus {bus_name!r}: expected INTERFACE:CHANNEL, for example socketcan:vcan0")
         try:
-            self._bus = can.Bus(channel=channel, interface=interface)
-        except (can.CanError, OSError, ValueError, ImportError) as error:
+            # A python-can configuration file of the user's must not change what was asked for.
+            self._bus = can.Bus(channel=channel, interface=interface, ignore_config=True)
+        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError, NameError) as error:
+            # NameError: what python-can's Kvaser interface raises where the maker's library is not installed.
             raise LinkError(f"bus {bus_name!r} does not open: {error}") from error
         self.name = bus_name
+        self.is_alive = True
         self.send_errors = 0
         self.receive_errors = 0
         self.ignored_frames = 0
 
     def receive(self) -> list[CanFrame]:
         """All frames that have arrived since the last call, oldest first."""
+        now_ns = time.monotonic_ns()
         frames: list[CanFrame] = []
         for _ in range(MAX_FRAMES_PER_RECEIVE):
             try:
                 message = self._bus.recv(timeout=0)
             except (can.CanError, OSError):
                 self.receive_errors += 1
+                self.is_alive = False
                 break
             if message is None:
                 break
-            if message.is_error_frame or message.is_remote_frame or message.is_extended_id:
+            self.is_alive = True
+            if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
                 self.ignored_frames += 1
                 continue
-            frames.append(CanFrame(message.arbitration_id, bytes(message.data), time.monotonic_ns()))
+            frames.append(CanFrame(message.arbitration_id, bytes(message.data), now_ns))
         return frames
 
     def send(self, frames: list[CanFrame]) -> None:
@@ -62,6 +82,9 @@ class CanLink:
                 self._bus.send(can.Message(arbitration_id=frame.arbitration_id, data=frame.data, is_extended_id=False))
             except (can.CanError, OSError):
                 self.send_errors += 1
+                self.is_alive = False
+            else:
+                self.is_alive = True
 
     def close(self) -> None:
         """Leave the bus."""

@@ -1,0 +1,209 @@
+"""Bus values to SI and back: the only module of the gateway that knows message and signal names, degrees and per cent."""
+
+import math
+from dataclasses import dataclass
+
+from dbc.catalogue import Catalogue
+from dbc.e2e import E2EProtector
+from dbc.frame import CanFrame
+from gateway.limits import Demand, clamp
+from gateway.messages import Mode
+
+NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelVehicle", "MilliTime", "NcomStatus00")
+ROBOT_MESSAGES = ("RC_SafetyStatus", "SR_Status", "AR_Status", "BR_Status")
+NEEDED_MESSAGES = NAVIGATION_MESSAGES + ROBOT_MESSAGES
+
+USABLE_POSITION_MODES = ("RTKInteger", "RTKFloat", "GxInteger", "GxFloat", "IxInteger", "IxFloat")
+"""Position modes good to about 0.2 m; with any other the car would leave its lane without noticing."""
+
+_NS_PER_MS = 1_000_000
+_MPS_PER_KMH = 1.0 / 3.6
+
+
+@dataclass(slots=True)
+class Measurement:
+    """Everything the gateway knows of the car, in SI units and ISO 8855 axes; updated in place as messages arrive."""
+
+    x_m: float = 0.0
+    y_m: float = 0.0
+    yaw_rad: float = 0.0
+    vx_mps: float = 0.0
+    vy_mps: float = 0.0
+    yaw_rate_radps: float = 0.0
+    ax_mps2: float = 0.0
+    navigation_time_ms: int = -1
+    is_navigation_precise: bool = False
+    steering_wheel_rad: float = 0.0
+    accelerator_norm: float = 0.0
+    brake_norm: float = 0.0
+    has_robot_fault: bool = False
+    has_command_timeout: bool = False
+    is_armed: bool = False
+    is_engaged: bool = False
+    is_stopped_by_robots: bool = False
+    is_dead_man_pressed: bool = False
+    is_driver_override: bool = False
+    are_robots_ready: bool = False
+    stop_source: str = "None"
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLimits:
+    """Limits that travel with every command for the robots to apply themselves."""
+
+    steering_wheel_rate_radps: float
+    steering_torque_nm: float = 40.0
+    pedal_rate_mps: float = 1.0
+    accelerator_force_n: float = 200.0
+    brake_force_n: float = 1000.0
+    max_speed_mps: float = 36.0
+
+
+class Codec:
+    """Decodes measurements and encodes demands by the catalogue."""
+
+    def __init__(self, catalogue: Catalogue, limits: RobotLimits) -> None:
+        self._catalogue = catalogue
+        self._limits = limits
+        self._protectors = {
+            spec.name: E2EProtector(spec.e2e_data_id) for spec in catalogue.by_name.values() if spec.e2e_data_id is not None
+        }
+        self._system_states = catalogue.enumeration("RC_SafetyStatus", "SystemState")
+        self._stop_sources = {raw: name for name, raw in catalogue.enumeration("RC_SafetyStatus", "StopSource").items()}
+        self._requests = catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
+        modes = catalogue.enumeration("NcomStatus00", "PosMode")
+        self._usable_position_modes = {modes[name] for name in USABLE_POSITION_MODES}
+        self._steer_modes = catalogue.enumeration("SR_Command", "Mode")
+        self._pedal_modes = catalogue.enumeration("AR_Command", "Mode")
+        self._challenge = 0
+
+    def update(self, measurement: Measurement, values: dict[str, dict[str, float]]) -> None:
+        """Take the newest values of each message into the measurement."""
+        for name, decode in _DECODERS.items():
+            if name in values:
+                decode(measurement, values[name])
+        if status := values.get("RC_SafetyStatus"):
+            self._update_supervisor(measurement, status)
+        if navigation := values.get("NcomStatus00"):
+            measurement.is_navigation_precise = int(navigation["PosMode"]) in self._usable_position_modes
+        robots = [values[name] for name in ROBOT_MESSAGES[1:] if name in values]
+        if len(robots) == len(ROBOT_MESSAGES) - 1:
+            measurement.has_robot_fault = any(robot["Fault"] for robot in robots)
+            measurement.has_command_timeout = any(robot["CommandTimeout"] for robot in robots)
+
+    def _update_supervisor(self, measurement: Measurement, status: dict[str, float]) -> None:
+        state = int(status["SystemState"])
+        measurement.is_armed = state == self._system_states["Armed"]
+        measurement.is_engaged = state == self._system_states["Engaged"]
+        stopped = ("EStop", "ControlledStop", "Fault")
+        measurement.is_stopped_by_robots = bool(status["EmergencyStopActive"]) or state in {self._system_states[s] for s in stopped}
+        measurement.is_dead_man_pressed = bool(status["DeadManPressed"])
+        measurement.is_driver_override = bool(status["DriverOverride"])
+        measurement.are_robots_ready = bool(status["SrReady"] and status["ArReady"] and status["BrReady"])
+        measurement.stop_source = self._stop_sources.get(int(status["StopSource"]), "unknown")
+
+    def encode(self, now_ns: int, mode: Mode, demand: Demand, command_age_ms: float, is_navigation_valid: bool) -> list[CanFrame]:
+        """The cyclic frames of one tick: safety command and the three robot commands."""
+        limits = self._limits
+        self._challenge = (self._challenge + 1) % 256
+        is_active = mode in (Mode.ENGAGED, Mode.SAFE_STOP)
+        steer_mode = self._steer_modes["AnglePosition" if is_active else "Standby"]
+        pedal_mode = self._pedal_modes["Position" if is_active else "Standby"]
+        messages: dict[str, dict[str, float]] = {
+            "GW_SafetyCommand": {
+                "SystemRequest": self._requests[_REQUEST_OF_MODE[mode]],
+                "WatchdogChallenge": self._challenge,
+                "MaxSpeed": limits.max_speed_mps / _MPS_PER_KMH,
+                "NavigationValid": is_navigation_valid,
+                "TrajectoryValid": mode is Mode.ENGAGED,
+                "CommandAge": clamp(command_age_ms, 0.0, 255.0),
+            },
+            "SR_Command": {
+                "Mode": steer_mode,
+                "Enable": is_active,
+                "AngleCommand": math.degrees(demand.steering_wheel_rad),
+                "RateLimit": math.degrees(limits.steering_wheel_rate_radps),
+                "TorqueLimit": limits.steering_torque_nm,
+            },
+            "AR_Command": _pedal_command(pedal_mode, is_active, demand.accelerator_norm, limits, limits.accelerator_force_n),
+            "BR_Command": _pedal_command(pedal_mode, is_active, demand.brake_norm, limits, limits.brake_force_n),
+        }
+        return [self._frame(name, values, now_ns) for name, values in messages.items()]
+
+    def encode_heartbeat(self, now_ns: int, uptime_s: float, rejected: int) -> CanFrame:
+        """The life sign for bus monitors."""
+        return self._frame("GW_Heartbeat", {"UpTime": uptime_s, "RxErrorCount": min(rejected, 255)}, now_ns)
+
+    def _frame(self, name: str, values: dict[str, float], now_ns: int) -> CanFrame:
+        payload = self._catalogue.encode(name, values)
+        if protector := self._protectors.get(name):
+            payload = protector.protect(payload)
+        return CanFrame(self._catalogue.by_name[name].arbitration_id, payload, now_ns)
+
+
+_REQUEST_OF_MODE = {
+    Mode.STANDBY: "Disarm",
+    Mode.READY: "Arm",
+    Mode.ENGAGED: "Engage",
+    Mode.SAFE_STOP: "Engage",
+    Mode.FAULT: "Disarm",
+}
+
+
+def _pedal_command(mode: int, is_active: bool, position_norm: float, limits: RobotLimits, force_n: float) -> dict[str, float]:
+    return {
+        "Mode": mode,
+        "Enable": is_active,
+        "PositionCommand": 100.0 * position_norm,
+        "RateLimit": 1000.0 * limits.pedal_rate_mps,
+        "ForceLimit": force_n,
+    }
+
+
+def _decode_position(m: Measurement, v: dict[str, float]) -> None:
+    m.x_m, m.y_m = v["PosLocalX"], v["PosLocalY"]
+
+
+def _decode_velocity(m: Measurement, v: dict[str, float]) -> None:
+    m.vx_mps, m.vy_mps = v["VelForward"], -v["VelLateral"]  # the instrument counts lateral to the right
+
+
+def _decode_yaw(m: Measurement, v: dict[str, float]) -> None:
+    m.yaw_rad = math.radians(v["AngleLocalYaw"])
+
+
+def _decode_yaw_rate(m: Measurement, v: dict[str, float]) -> None:
+    m.yaw_rate_radps = -math.radians(v["AngRateZ"])  # about the axis that points down
+
+
+def _decode_acceleration(m: Measurement, v: dict[str, float]) -> None:
+    m.ax_mps2 = v["AccelX"]
+
+
+def _decode_time(m: Measurement, v: dict[str, float]) -> None:
+    m.navigation_time_ms = int(v["MilliTime"])
+
+
+def _decode_steering(m: Measurement, v: dict[str, float]) -> None:
+    m.steering_wheel_rad = math.radians(v["AngleActual"])
+
+
+def _decode_accelerator(m: Measurement, v: dict[str, float]) -> None:
+    m.accelerator_norm = 0.01 * v["PositionActual"]
+
+
+def _decode_brake(m: Measurement, v: dict[str, float]) -> None:
+    m.brake_norm = 0.01 * v["PositionActual"]
+
+
+_DECODERS = {
+    "PosLocal": _decode_position,
+    "VelocityLevel": _decode_velocity,
+    "VelYawLocal": _decode_yaw,
+    "RateVehicle": _decode_yaw_rate,
+    "AccelVehicle": _decode_acceleration,
+    "MilliTime": _decode_time,
+    "SR_Status": _decode_steering,
+    "AR_Status": _decode_accelerator,
+    "BR_Status": _decode_brake,
+}

@@ -1,0 +1,67 @@
+"""What the gateway believes of a command before anything else looks at it."""
+
+from collections import Counter
+
+from gateway.messages import CommandStatus, ControlCommand
+
+MAX_STATE_LAG = 10
+"""Oldest state that a command may answer, in gateway ticks: 100 ms, the age limit of a command."""
+MAX_CLOCK_OFFSET_NS = 200_000_000
+"""Largest distance between now and the start of a plan [ns]: beyond the delay that any controller compensates."""
+STEER_RANGE_RAD = 1.0
+DRIVE_RANGE_NORM = 4.0
+"""Ranges of a demand that can be meant; the limits that protect the car are applied later and are far inside."""
+
+NEVER_NS = 1 << 62
+
+
+class CommandGate:
+    """Admits commands of one sender, newest first; counts the others by cause.
+
+    Attributes:
+        newest: the last command that carries a usable plan, or None.
+        status: what the last admitted command says of itself.
+        good_in_a_row: commands of status OK since the last other one.
+        rejected: count by cause.
+    """
+
+    def __init__(self) -> None:
+        self.rejected: Counter[str] = Counter()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the sender: the next command may come from another one."""
+        self.newest: ControlCommand | None = None
+        self.status = CommandStatus.OK
+        self.good_in_a_row = 0
+        self._boot_id: int | None = None
+        self._last_seq = -1
+        self._admitted_ns: int | None = None
+
+    def offer(self, now_ns: int, command: ControlCommand | None, state_seq: int) -> None:
+        """Take a command in, or count why not. `state_seq` is the last state that was sent out."""
+        if command is None:
+            return
+        if (cause := self._reject_cause(now_ns, command, state_seq)) is not None:
+            self.rejected[cause] += 1
+            return
+        self._boot_id, self._last_seq, self._admitted_ns = command.boot_id, command.seq, now_ns
+        self.status = command.status
+        self.good_in_a_row = self.good_in_a_row + 1 if command.status is CommandStatus.OK else 0
+        if command.status is not CommandStatus.FAILED:
+            self.newest = command
+
+    def age_ns(self, now_ns: int) -> int:
+        """Time since a command was last admitted [ns]; very large when there never was one."""
+        return NEVER_NS if self._admitted_ns is None else now_ns - self._admitted_ns
+
+    def _reject_cause(self, now_ns: int, command: ControlCommand, state_seq: int) -> str | None:
+        causes = (
+            ("second sender", self._boot_id is not None and command.boot_id != self._boot_id),
+            ("repeated or old sequence number", command.boot_id == self._boot_id and command.seq <= self._last_seq),
+            ("answers an old state", not state_seq - MAX_STATE_LAG <= command.state_seq <= state_seq),
+            ("time of another clock", abs(command.t_ns - now_ns) > MAX_CLOCK_OFFSET_NS),
+            ("steering out of range", any(abs(steer) > STEER_RANGE_RAD for steer in command.plan_steer_rad)),
+            ("drive out of range", any(abs(drive) > DRIVE_RANGE_NORM for drive in command.plan_drive_norm)),
+        )
+        return next((name for name, is_true in causes if is_true), None)

@@ -1,0 +1,241 @@
+"""The gateway in closed loop with a stub car, in virtual time: engagement, hand-over, stops, limits."""
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dbc.frame import CanFrame
+from gateway.core import TICK_NS
+from gateway.messages import CommandStatus, Mode, Operation
+from gateway.modes import Event
+from tests.support.drive import GatewayDrive
+
+
+def test_state_is_si_and_iso_8855():
+    drive = GatewayDrive().tick(5)
+    state = drive.output.state
+    assert state.is_valid
+    assert (state.x_m, state.y_m, state.vx_mps) == (12.5, -3.25, 20.0)
+    assert state.vy_mps == -0.5  # the instrument counts to the right
+    assert state.yaw_rad == pytest.approx(math.radians(10.0))
+    assert state.yaw_rate_radps == pytest.approx(math.radians(5.0))
+    assert state.t_ns == drive.now_ns
+
+
+def test_silent_until_engaged():
+    drive = GatewayDrive()
+    drive.steer_rad, drive.drive_norm = 0.1, 0.5
+    for _ in range(200):
+        drive.tick()
+        for robot in ("SR", "AR", "BR"):
+            told = drive.car.told[f"{robot}_Command"]
+            assert told["Enable"] == 0
+            assert told.get("AngleCommand", 0) == 0
+            assert told.get("PositionCommand", 0) == 0
+    assert drive.core.mode is Mode.READY
+
+
+def test_engagement_needs_the_operator_and_acts_once_per_request():
+    drive = GatewayDrive().engage()
+    drive.ask(Operation.DISENGAGE)
+    drive.tick()
+    assert drive.core.mode is Mode.STANDBY
+    drive.tick(200)
+    assert drive.core.mode is Mode.READY  # and not ENGAGED: nothing re-engages by itself
+
+
+@pytest.mark.parametrize(
+    ("break_it", "named"),
+    [
+        (lambda d: d.car.silent.add("PosLocal"), "PosLocal"),
+        (lambda d: d.car.corrupt.add("SR_Status"), "SR_Status"),
+        (lambda d: setattr(d.car, "position_mode", "SPS"), "position mode"),
+        (lambda d: setattr(d.car, "dead_man", 0), "dead-man"),
+        (lambda d: setattr(d.car, "override", 1), "driver override"),
+        (lambda d: setattr(d.car, "fault", 1), "fault"),
+        (lambda d: setattr(d.car, "is_time_frozen", True), "frozen"),
+        (lambda d: setattr(d, "is_controller_alive", False), "controller silent"),
+        (lambda d: setattr(d, "status", CommandStatus.DEGRADED), "good commands"),
+    ],
+)
+def test_not_ready_names_every_reason(break_it, named):
+    drive = GatewayDrive()
+    break_it(drive)
+    drive.tick(150)
+    assert drive.core.mode is Mode.STANDBY
+    assert any(named in blocker for blocker in drive.core.blockers), drive.core.blockers
+    drive.ask(Operation.ENGAGE)
+    drive.tick(5)
+    assert drive.core.mode is Mode.STANDBY
+
+
+def test_hand_over_has_no_bump():
+    drive = GatewayDrive()
+    drive.car.steering_wheel_deg = 30.0
+    drive.car.accelerator_percent = 25.0
+    drive.engage()
+    told = drive.car.told
+    assert told["SR_Command"]["AngleCommand"] == pytest.approx(30.0, abs=8.1)  # one tick at 800 deg/s
+    assert told["AR_Command"]["PositionCommand"] == pytest.approx(25.0, abs=20.1)  # one tick of braking rate
+
+
+def test_command_reaches_the_robots_in_their_units():
+    drive = GatewayDrive()
+    drive.steer_rad, drive.drive_norm = 0.05, 0.4
+    drive.engage().tick(50)
+    assert drive.car.told["SR_Command"]["AngleCommand"] == pytest.approx(math.degrees(0.05 * 14.7), abs=0.03)
+    assert drive.car.told["AR_Command"]["PositionCommand"] == pytest.approx(40.0, abs=0.01)
+    assert drive.car.told["BR_Command"]["PositionCommand"] == 0.0
+    drive.drive_norm = -0.5
+    drive.tick(50)
+    assert drive.car.told["AR_Command"]["PositionCommand"] == 0.0
+    assert drive.car.told["BR_Command"]["PositionCommand"] == pytest.approx(100 * 0.5 * 4838.7 / 15000.0, abs=0.01)
+
+
+def test_accelerator_waits_for_the_brake_pedal():
+    drive = GatewayDrive()
+    drive.drive_norm = 0.5
+    drive.engage()
+    drive.car.brake_percent = 10.0
+    drive.tick(50)
+    assert drive.car.told["AR_Command"]["PositionCommand"] == 0.0
+    drive.car.brake_percent = 0.0
+    drive.tick(2)
+    assert drive.car.told["AR_Command"]["PositionCommand"] > 0.0
+
+
+def test_one_missed_command_is_tolerated_two_are_not():
+    drive = GatewayDrive().engage()
+    while drive._ticks % 4 != 1:
+        drive.tick()  # the controller has just answered
+    drive.is_controller_alive = False
+    drive.tick(7)  # one command missed, then it comes back
+    drive.is_controller_alive = True
+    drive.tick(10)
+    assert drive.core.mode is Mode.ENGAGED
+    drive.is_controller_alive = False
+    drive.tick(20)
+    assert drive.core.mode is Mode.SAFE_STOP
+    assert drive.transitions[-1].event is Event.COMMAND_LOST
+
+
+def test_silent_controller_stops_the_car_within_120_ms():
+    drive = GatewayDrive().engage()
+    while drive._ticks % 4 != 1:
+        drive.tick()
+    last_command_ns = drive.now_ns
+    drive.is_controller_alive = False
+    drive.tick(30)
+    assert drive.transitions[-1].t_ns - last_command_ns <= 120_000_000
+    assert drive.transitions[-1].t_ns - last_command_ns > 100_000_000
+    drive.tick(250)
+    assert drive.car.told["BR_Command"]["PositionCommand"] == pytest.approx(100 * 1500 * 2.5 / 15000, abs=0.1)
+    drive.car.vx_mps = 0.0
+    drive.tick(2)
+    assert drive.car.told["BR_Command"]["PositionCommand"] == pytest.approx(30.0)  # held
+    drive.car.vx_mps = 1.0
+    drive.tick(2)
+    assert drive.car.told["BR_Command"]["PositionCommand"] == pytest.approx(30.0)  # and stays held
+
+
+def test_safe_stop_follows_the_tail_of_the_plan():
+    drive = GatewayDrive()
+    drive.engage().tick(20)
+    drive.plan_steer_rad = tuple(0.001 * k for k in range(30))
+    drive.tick(8)
+    drive.is_controller_alive = False
+    start = drive.core.commands.newest
+    drive.tick(60)
+    k = (drive.now_ns - start.t_ns) // 40_000_000
+    assert k > 5
+    assert drive.car.told["SR_Command"]["AngleCommand"] == pytest.approx(math.degrees(0.001 * k * 14.7), abs=0.05)
+    drive.tick(200)
+    assert drive.car.told["SR_Command"]["AngleCommand"] == pytest.approx(math.degrees(0.029 * 14.7), abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "event", "mode"),
+    [
+        (lambda d: d.car.silent.add("VelocityLevel"), Event.STATE_LOST, Mode.SAFE_STOP),
+        (lambda d: d.car.corrupt.add("BR_Status"), Event.STATE_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "is_time_frozen", True), Event.STATE_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "position_mode", "Blanked"), Event.STATE_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "fault", 1), Event.ROBOT_FAULT, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "command_timeout", 1), Event.ROBOT_FAULT, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "system_state", "Armed"), Event.ROBOT_FAULT, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "system_state", "EStop"), Event.EMERGENCY_STOP, Mode.FAULT),
+        (lambda d: setattr(d, "status", CommandStatus.FAILED), Event.COMMAND_FAILED, Mode.SAFE_STOP),
+        (lambda d: setattr(d, "command_boot_id", 8), Event.COMMAND_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d, "steer_rad", 3.0), Event.COMMAND_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d, "now_ns", d.now_ns + 60_000_000), Event.TICK_GAP, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "override", 1), Event.DRIVER_OVERRIDE, Mode.STANDBY),
+    ],
+)
+def test_every_fault_ends_the_engagement_with_its_name(break_it, event, mode):
+    drive = GatewayDrive().engage().tick(50)
+    assert drive.core.mode is Mode.ENGAGED
+    break_it(drive)
+    drive.tick(20)
+    assert drive.core.mode is mode
+    assert [t.event for t in drive.transitions if t.before is Mode.ENGAGED] == [event]
+    drive.tick(200)
+    assert drive.core.mode is not Mode.ENGAGED
+
+
+def test_reset_leaves_a_safe_stop_and_allows_a_new_engagement():
+    drive = GatewayDrive().engage().tick(50)
+    drive.status = CommandStatus.FAILED
+    drive.tick(10)
+    assert drive.core.mode is Mode.SAFE_STOP
+    drive.status = CommandStatus.OK
+    drive.ask(Operation.RESET)
+    drive.tick()
+    assert drive.core.mode is Mode.STANDBY
+    drive.engage()
+
+
+def test_heartbeat_every_100_ms():
+    drive = GatewayDrive()
+    heartbeat_id = drive.catalogue.by_name["GW_Heartbeat"].arbitration_id
+    beats = [any(f.arbitration_id == heartbeat_id for f in drive.tick().output.frames) for _ in range(100)]
+    assert sum(beats) == 10
+
+
+@given(
+    steers=st.lists(st.floats(-1.0, 1.0), min_size=5, max_size=30),
+    drives=st.lists(st.floats(-4.0, 4.0), min_size=5, max_size=30),
+    vx_mps=st.floats(0.0, 36.0),
+)
+@settings(max_examples=30, deadline=None)
+def test_no_demand_ever_breaks_a_limit(steers, drives, vx_mps):
+    drive = GatewayDrive().engage()
+    drive.car.vx_mps = round(vx_mps, 2)
+    drive.tick(60)
+    previous_deg = drive.car.told["SR_Command"]["AngleCommand"]
+    for steer, drive_norm in zip(steers, drives, strict=False):
+        drive.steer_rad, drive.drive_norm = steer, drive_norm
+        for _ in range(4):
+            drive.tick()
+            told = drive.car.told
+            angle_deg = told["SR_Command"]["AngleCommand"]
+            assert abs(angle_deg - previous_deg) <= 800.0 * TICK_NS * 1e-9 + 0.05
+            if vx_mps > 1.0:
+                road_wheel = math.radians(angle_deg) / 14.7
+                assert vx_mps**2 * math.tan(abs(road_wheel)) / 2.648 <= 15.0 * 1.01 + 0.05
+            assert not (told["AR_Command"]["PositionCommand"] > 0 and told["BR_Command"]["PositionCommand"] > 0)
+            previous_deg = angle_deg
+    assert drive.core.mode is Mode.ENGAGED
+
+
+@given(data=st.data())
+@settings(max_examples=100, deadline=None)
+def test_no_frame_makes_the_core_raise(data):
+    drive = GatewayDrive().tick(3)
+    now_ns = drive.now_ns + TICK_NS
+    ids = st.one_of(st.sampled_from(sorted(drive.catalogue.by_id)), st.integers(0, 2047))
+    frames = data.draw(st.lists(st.builds(CanFrame, ids, st.binary(max_size=8), st.just(now_ns)), max_size=40))
+    output = drive.core.step(now_ns, frames)
+    assert output.state.mode is Mode.STANDBY
+    assert drive.core.supervisor.received >= len(frames)
