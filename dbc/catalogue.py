@@ -16,6 +16,7 @@ from cantools.database.can.signal import Signal
 from cantools.database.errors import Error as CantoolsError
 
 from dbc.e2e import COUNTER_START_BIT, CRC_START_BIT, PROFILE
+from dbc.errors import UserMistake
 from dbc.frame import CanFrame
 
 ROBOTS_DBC = Path(__file__).with_name("robots.dbc")
@@ -26,7 +27,7 @@ _CRC_SIGNAL = "Crc"
 _COUNTER_SIGNAL = "AliveCounter"
 
 
-class CatalogueError(Exception):
+class CatalogueError(UserMistake):
     """A DBC file cannot be used; the text names the file and the message."""
 
 
@@ -83,6 +84,16 @@ class Catalogue:
         self._start_values[spec.name] = {
             name: float(min(max(0.0, minimum), maximum)) for name, minimum, maximum in self._ranges[spec.name]
         }
+
+    def require(self, names: Iterable[str], user: str) -> None:
+        """Check that the messages which `user` works with are there.
+
+        Raises:
+            CatalogueError: some are not; all of them are named.
+        """
+        if missing := [name for name in names if name not in self.by_name]:
+            files = ", ".join(self.sha256)
+            raise CatalogueError(f"{files}: no message {', '.join(missing)}, which the {user} needs")
 
     def signals(self, name: str) -> tuple[str, ...]:
         """Names of the signals of message `name`, in the order of the DBC."""

@@ -9,13 +9,14 @@ from typing import Self
 
 import can
 
+from dbc.errors import SetupFailure
 from dbc.frame import CanFrame
 
 MAX_FRAMES_PER_RECEIVE = 512
 """Bound on one call, so that a flood of frames cannot hold the caller's loop."""
 
 
-class LinkError(Exception):
+class LinkError(SetupFailure):
     """The bus cannot be opened; one line that says why."""
 
 
@@ -59,20 +60,27 @@ class CanLink:
         """All frames that have arrived since the last call, oldest first."""
         now_ns = time.monotonic_ns()
         frames: list[CanFrame] = []
+        is_refused = False
         for _ in range(MAX_FRAMES_PER_RECEIVE):
             try:
                 message = self._bus.recv(timeout=0)
             except (can.CanError, OSError):
-                self.receive_errors += 1
-                self.is_alive = False
-                break
+                # SocketCAN reports an error ahead of the frames that came before it; a second error says there are none.
+                if is_refused:
+                    break
+                is_refused = True
+                continue
             if message is None:
                 break
-            self.is_alive = True
             if message.is_error_frame or message.is_remote_frame or message.is_extended_id or message.is_fd:
                 self.ignored_frames += 1
                 continue
             frames.append(CanFrame(message.arbitration_id, bytes(message.data), now_ns))
+        if is_refused:
+            self.receive_errors += 1
+            self.is_alive = False
+        elif frames:
+            self.is_alive = True
         return frames
 
     def send(self, frames: list[CanFrame]) -> None:

@@ -6,6 +6,8 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from dbc.errors import UserMistake
+
 FOCUS = Path(__file__).with_name("focus.toml")
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -13,7 +15,7 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
-class VehicleError(Exception):
+class VehicleError(UserMistake):
     """A vehicle file cannot be used; one line per mistake, each with file and key."""
 
 

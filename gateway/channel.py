@@ -5,6 +5,7 @@ import socket
 from pathlib import Path
 from typing import Self, TypeVar
 
+from dbc.errors import SetupFailure
 from gateway.messages import Datagram, pack, unpack
 
 MAX_DATAGRAM_BYTES = 2048
@@ -14,7 +15,7 @@ MAX_DATAGRAMS_PER_POLL = 256
 T = TypeVar("T", bound=Datagram)
 
 
-class ChannelError(Exception):
+class ChannelError(SetupFailure):
     """A socket cannot be opened; one line that says which."""
 
 

@@ -12,6 +12,7 @@ from gateway.messages import Mode
 NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelVehicle", "MilliTime", "NcomStatus00")
 ROBOT_MESSAGES = ("RC_SafetyStatus", "SR_Status", "AR_Status", "BR_Status")
 NEEDED_MESSAGES = NAVIGATION_MESSAGES + ROBOT_MESSAGES
+COMMAND_MESSAGES = ("GW_SafetyCommand", "SR_Command", "AR_Command", "BR_Command", "GW_Heartbeat")
 
 USABLE_POSITION_MODES = ("RTKInteger", "RTKFloat", "GxInteger", "GxFloat", "IxInteger", "IxFloat")
 """Position modes good to about 0.2 m; with any other the car would leave its lane without noticing."""
@@ -63,6 +64,7 @@ class Codec:
     """Decodes measurements and encodes demands by the catalogue."""
 
     def __init__(self, catalogue: Catalogue, limits: RobotLimits) -> None:
+        catalogue.require(NEEDED_MESSAGES + COMMAND_MESSAGES, "gateway")
         self._catalogue = catalogue
         self._limits = limits
         self._protectors = {

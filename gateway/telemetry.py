@@ -18,6 +18,8 @@ from typing import Self
 import msgspec
 import zenoh
 
+from dbc.errors import SetupFailure
+
 DEFAULT_BASE_PORT = 7447
 KEY_PREFIX = "xilgate"
 
@@ -197,7 +199,7 @@ def topic_of(sample: Sample) -> str:
     return _TOPIC_OF[type(sample)]
 
 
-class TelemetryError(Exception):
+class TelemetryError(SetupFailure):
     """Telemetry cannot be opened; one line that says why."""
 
 

@@ -46,7 +46,8 @@ def test_extremes_of_every_signal_survive(message, signal):
 def test_round_trip_within_half_a_bit(data):
     message, signal = data.draw(st.sampled_from(SIGNALS))
     value = data.draw(st.floats(float(signal.minimum), float(signal.maximum)))
-    decoded = CATALOGUE.decode(CATALOGUE.by_name[message.name], frame_of(message.name, CATALOGUE.encode(message.name, {signal.name: value})))
+    frame = frame_of(message.name, CATALOGUE.encode(message.name, {signal.name: value}))
+    decoded = CATALOGUE.decode(CATALOGUE.by_name[message.name], frame)
     assert decoded[signal.name] == pytest.approx(value, abs=0.5000001 * abs(signal.scale))
 
 
@@ -90,7 +91,7 @@ def test_broken_dbc_is_one_line_with_its_path(tmp_path, content, named):
 
 
 def test_missing_dbc_and_clash(tmp_path):
-    with pytest.raises(CatalogueError, match="nowhere.dbc"):
+    with pytest.raises(CatalogueError, match=r"nowhere\.dbc"):
         load([tmp_path / "nowhere.dbc"])
     with pytest.raises(CatalogueError, match="defined twice"):
         load([ROBOTS_DBC, ROBOTS_DBC])
@@ -99,7 +100,7 @@ def test_missing_dbc_and_clash(tmp_path):
 def test_protection_without_data_id_is_refused(tmp_path):
     path = tmp_path / "site.dbc"
     path.write_text(ROBOTS_DBC.read_text().replace('BA_ "E2EDataId" BO_ 272 17;', ""))
-    with pytest.raises(CatalogueError, match="SR_Command.*E2EDataId"):
+    with pytest.raises(CatalogueError, match=r"SR_Command.*E2EDataId"):
         load([path])
 
 

@@ -1,0 +1,70 @@
+# One file of commands for people and CI. Everything lives in .venv; the lock files say what is in it.
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+INSTALL := $(PIP) install --require-hashes --only-binary :all:
+
+.PHONY: setup run test lint bench clean lock
+
+setup: $(VENV)/project.stamp
+	@set -- $$CC; for compiler in $$1 cc gcc clang; do \
+	    if path=$$(command -v "$$compiler"); then echo "C compiler: $$path"; exit 0; fi; \
+	done; \
+	$(MAKE) --silent $(VENV)/ziglang.stamp && echo "C compiler: none found, using Python package ziglang in $(VENV)"
+
+run: setup
+	$(BIN)/xilgate drive
+
+test: setup $(VENV)/dev.stamp
+	$(BIN)/python -m pytest
+
+lint: setup $(VENV)/dev.stamp
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+bench: setup
+	$(BIN)/xilgate bench solver
+	$(BIN)/xilgate bench gateway
+
+clean:
+	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -prune -exec rm -rf {} +
+
+# The lock files, brought up to pyproject.toml; needs uv. What builds the project is locked with what runs it.
+BUILD_REQUIRES := import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"], "editables", sep="\n")
+LOCK := UV_CUSTOM_COMPILE_COMMAND="make lock" uv pip compile --quiet --generate-hashes --universal --fork-strategy fewest --python-version 3.11
+lock:
+	python3 -c '$(BUILD_REQUIRES)' | $(LOCK) pyproject.toml - --output-file requirements.lock
+	python3 -c '$(BUILD_REQUIRES)' | $(LOCK) pyproject.toml - --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+	echo ziglang | $(LOCK) - --output-file requirements-ziglang.lock
+
+$(VENV)/python.stamp:
+	@for python in python3 python3.11 python3.12 python3.13 python3.14; do \
+	    if $$python -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; then \
+	        echo "Setting up $(VENV) with $$($$python --version)"; \
+	        $$python -m venv $(VENV) || { echo "setup: cannot make $(VENV); on Debian: apt-get install python3-venv" >&2; exit 1; }; \
+	        touch $@; exit 0; \
+	    fi; \
+	done; \
+	echo "setup: Python 3.11 or newer is needed, found $$(python3 --version 2>/dev/null || echo none)" >&2; exit 1
+
+$(VENV)/run.stamp: requirements.lock $(VENV)/python.stamp
+	@echo "Installing $<"
+	@$(INSTALL) -r $<
+	@touch $@
+
+# Without build isolation nothing unpinned is fetched.
+$(VENV)/project.stamp: pyproject.toml $(VENV)/run.stamp
+	@$(PIP) install --no-deps --no-build-isolation --no-index --editable .
+	@touch $@
+
+$(VENV)/dev.stamp: requirements-dev.lock $(VENV)/run.stamp
+	@echo "Installing $<"
+	@$(INSTALL) -r $<
+	@touch $@
+
+$(VENV)/ziglang.stamp: requirements-ziglang.lock $(VENV)/run.stamp
+	@echo "Installing $<"
+	@$(INSTALL) -r $<
+	@touch $@

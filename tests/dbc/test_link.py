@@ -1,0 +1,228 @@
+"""The link on every kind of bus: same frames, never an exception, and a dead bus that shows."""
+
+import tempfile
+import threading
+from pathlib import Path
+
+import can
+import pytest
+
+from dbc.frame import CanFrame
+from dbc.link import MAX_FRAMES_PER_RECEIVE, CanLink, LinkError
+from vehicle_emulator.bus.hub import Hub
+from xil.bus import socketcan_problem
+
+PATIENCE_S = 20.0
+
+
+class ServedChannel:
+    """A hub whose turns run in a thread until it is stopped."""
+
+    def __init__(self, channel):
+        self.hub = Hub(channel)
+        self.stopping = threading.Event()
+        self.thread = threading.Thread(target=self._turns)
+        self.thread.start()
+
+    def _turns(self):
+        while not self.stopping.is_set():
+            self.hub.turn(0.02)
+
+    def stop(self):
+        self.stopping.set()
+        self.thread.join()
+        self.hub.close()
+
+
+@pytest.fixture
+def served(monkeypatch):
+    # Not tmp_path: a socket name has at most 107 bytes.
+    with tempfile.TemporaryDirectory(prefix="xil", dir="/tmp") as directory:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
+        channel = ServedChannel("bus0")
+        yield channel
+        if channel.thread.is_alive():
+            channel.stop()
+
+
+@pytest.fixture(params=["virtual:link", "xilgate:bus0", "socketcan:vcan0"])
+def bus_name(request, served):
+    if request.param.startswith("socketcan") and (problem := socketcan_problem("vcan0")):
+        pytest.skip("; ".join(problem))
+    return request.param
+
+
+def receive(link: CanLink, count: int) -> list[CanFrame]:
+    """Poll until `count` frames have come."""
+    frames: list[CanFrame] = []
+    waiting = threading.Event()
+    for _ in range(int(PATIENCE_S / 0.002)):
+        frames += link.receive()
+        if len(frames) >= count:
+            return frames
+        waiting.wait(0.002)
+    raise AssertionError(f"only {len(frames)} of {count} frames")
+
+
+def python_can_bus(name: str, **settings) -> can.BusABC:
+    interface, _, channel = name.partition(":")
+    return can.Bus(interface=interface, channel=channel, **settings)
+
+
+def test_frames_arrive_in_order_and_not_at_their_sender(bus_name):
+    frames = [CanFrame(identifier, bytes([identifier % 256] * length), 0) for identifier, length in ((0x7FF, 8), (0, 0), (0x110, 3))]
+    with CanLink(bus_name) as a, CanLink(bus_name) as b:
+        a.send(frames)
+        received = receive(b, 3)
+        assert [frame._replace(t_ns=0) for frame in received] == frames
+        assert a.receive() == []
+        b.send(frames[:1])
+        assert receive(a, 1)[0].arbitration_id == 0x7FF
+        assert (a.is_alive, a.send_errors, a.receive_errors, a.ignored_frames) == (True, 0, 0, 0)
+
+
+def test_frames_of_one_poll_carry_its_time_and_polls_go_forward(bus_name, monkeypatch):
+    clock_ns = iter(range(1000, 10**9, 1000))
+    monkeypatch.setattr("dbc.link.time.monotonic_ns", lambda: next(clock_ns))
+    with CanLink(bus_name) as a, CanLink(bus_name) as b:
+        a.send([CanFrame(1, b"", 0)])
+        (first,) = receive(b, 1)
+        a.send([CanFrame(2, b"", 0)])
+        (second,) = receive(b, 1)
+    assert 1000 <= first.t_ns < second.t_ns
+
+
+def test_only_classical_data_frames_with_11_bits_pass(bus_name):
+    strange = [
+        can.Message(arbitration_id=0x110, is_extended_id=True, data=bytes(8)),
+        can.Message(arbitration_id=0x110, is_extended_id=False, is_remote_frame=True, dlc=8),
+    ]
+    if not bus_name.startswith("socketcan"):  # whose kernel keeps CAN FD from a classical socket, and makes error frames itself
+        strange.append(can.Message(arbitration_id=0x110, is_extended_id=False, is_fd=True, data=bytes(12)))
+        strange.append(can.Message(arbitration_id=0x040, is_extended_id=False, is_error_frame=True, data=bytes(8)))
+    settings = {"fd": True} if bus_name.startswith("xilgate") else {}
+    with CanLink(bus_name) as link, python_can_bus(bus_name, **settings) as other:
+        for message in strange:
+            other.send(message)
+        other.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=b"ok"))
+        assert [frame.data for frame in receive(link, 1)] == [b"ok"]
+        assert link.ignored_frames == len(strange)
+        assert link.is_alive
+
+
+def test_a_flood_does_not_hold_the_poll():
+    with CanLink("virtual:flood") as link, CanLink("virtual:flood") as other:
+        other.send([CanFrame(1, b"", 0)] * (MAX_FRAMES_PER_RECEIVE + 10))
+        assert len(link.receive()) == MAX_FRAMES_PER_RECEIVE
+        assert len(link.receive()) == 10
+
+
+def test_a_hub_that_goes_is_visible_and_never_raises(served):
+    with CanLink("xilgate:bus0") as a, CanLink("xilgate:bus0") as b:
+        a.send([CanFrame(1, b"", 0)])
+        assert len(receive(b, 1)) == 1
+        a.send([CanFrame(2, b"", 0)] * 3)
+        receive(b, 3)
+        served.stop()
+        assert b.receive() == []
+        assert (b.is_alive, b.receive_errors) == (False, 1)
+        assert a.is_alive  # it has not looked yet
+        a.send([CanFrame(3, b"", 0)] * 2)
+        assert (a.is_alive, a.send_errors) == (False, 2)
+
+
+def test_frames_that_came_before_the_hub_went_are_still_delivered(served):
+    with CanLink("xilgate:bus0") as a, CanLink("xilgate:bus0") as b, CanLink("xilgate:bus0") as witness:
+        a.send([CanFrame(1, b"", 0), CanFrame(2, b"", 0)])
+        receive(witness, 2)
+        served.stop()
+        assert [frame.arbitration_id for frame in b.receive()] == [1, 2]
+        assert not b.is_alive
+
+
+def test_a_refusal_that_passes_is_forgotten():
+    refusing = threading.Event()
+    with CanLink("virtual:refusal") as link:
+        accept = link._bus.send
+
+        def send(message):
+            if refusing.is_set():
+                raise can.CanOperationError("Failed to transmit: No buffer space available", 105)
+            accept(message)
+
+        link._bus.send = send
+        refusing.set()
+        link.send([CanFrame(1, b"", 0)])
+        assert (link.is_alive, link.send_errors) == (False, 1)
+        refusing.clear()
+        link.send([CanFrame(1, b"", 0)])
+        assert (link.is_alive, link.send_errors) == (True, 1)
+
+
+def test_an_interface_that_went_down_and_came_back_is_alive_again():
+    refusals = [OSError(100, "Network is down")]
+    with CanLink("virtual:down") as link, CanLink("virtual:down") as other:
+        deliver = link._bus.recv
+
+        def recv(timeout):
+            if refusals:
+                raise refusals.pop()
+            return deliver(timeout)
+
+        link._bus.recv = recv
+        assert link.receive() == []
+        assert (link.is_alive, link.receive_errors) == (False, 1)
+        assert link.receive() == []
+        assert not link.is_alive  # silence proves nothing
+        other.send([CanFrame(1, b"", 0)])
+        assert len(link.receive()) == 1
+        assert link.is_alive
+
+
+def test_an_error_ahead_of_old_frames_hides_neither():
+    refusals = [OSError(19, "No such device")]
+    with CanLink("virtual:removed") as link, CanLink("virtual:removed") as other:
+        deliver = link._bus.recv
+
+        def recv(timeout):
+            if refusals:
+                raise refusals.pop()
+            return deliver(timeout)
+
+        link._bus.recv = recv
+        other.send([CanFrame(1, b"", 0)])
+        assert len(link.receive()) == 1
+        assert (link.is_alive, link.receive_errors) == (False, 1)
+
+
+@pytest.mark.parametrize("name", ["", "vcan0", "socketcan:", ":vcan0"])
+def test_malformed_bus_name(name):
+    with pytest.raises(LinkError, match=r"expected INTERFACE:CHANNEL, for example socketcan:vcan0$"):
+        CanLink(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "cause"),
+    [
+        ("nosuch:0", "CAN interface 'nosuch' not supported"),
+        ("xilgate:nobody", "no hub serves xilgate channel 'nobody'"),
+        ("xilgate:a/b", "expected 1 to 32 letters"),
+        ("socketcan:nosuch0", "Errno"),
+    ],
+)
+def test_bus_that_does_not_open_is_one_line(served, name, cause):
+    with pytest.raises(LinkError) as raised:
+        CanLink(name)
+    text = str(raised.value)
+    assert text.startswith(f"bus {name!r} does not open: ")
+    assert cause in text
+    assert "\n" not in text
+
+
+def test_the_users_python_can_configuration_changes_nothing(monkeypatch, tmp_path):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    Path(tmp_path, "can.conf").write_text("[default]\nbitrate = rubbish\nreceive_own_messages = True\n", encoding="ascii")
+    monkeypatch.setenv("CAN_CONFIG", '{"receive_own_messages": true}')
+    with CanLink("virtual:configured") as link:
+        link.send([CanFrame(1, b"", 0)])
+        assert link.receive() == []

@@ -1,0 +1,43 @@
+"""A run-time directory of the test's own, and a hub that serves in a thread."""
+
+import tempfile
+import threading
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from vehicle_emulator.bus.hub import Hub
+
+
+@pytest.fixture(autouse=True)
+def runtime_directory(monkeypatch):
+    # Not tmp_path: a socket name has at most 107 bytes.
+    with tempfile.TemporaryDirectory(prefix="xil", dir="/tmp") as directory:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
+        yield Path(directory)
+
+
+@contextmanager
+def serving(channel: str):
+    """A hub whose turns run in a thread, closed at the end."""
+    stop = threading.Event()
+    with Hub(channel) as hub:
+
+        def turns():
+            while not stop.is_set():
+                hub.turn(0.02)
+
+        thread = threading.Thread(target=turns)
+        thread.start()
+        try:
+            yield hub
+        finally:
+            stop.set()
+            thread.join()
+
+
+@pytest.fixture
+def hub():
+    with serving("bus0") as served:
+        yield served
