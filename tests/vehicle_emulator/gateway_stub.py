@@ -1,0 +1,36 @@
+"""A gateway reduced to its frames, written from the DBC alone."""
+
+from dbc.catalogue import Catalogue
+from dbc.e2e import E2EProtector
+from dbc.frame import CanFrame
+
+
+class GatewayStub:
+    """Makes protected command frames; every call of `frames` advances the alive counters."""
+
+    def __init__(self, catalogue: Catalogue) -> None:
+        self.catalogue = catalogue
+        self.requests = catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
+        self._protectors: dict[str, E2EProtector] = {}
+
+    def frame(self, name: str, values: dict[str, float], t_ns: int = 0) -> CanFrame:
+        spec = self.catalogue.by_name[name]
+        assert spec.e2e_data_id is not None
+        protector = self._protectors.setdefault(name, E2EProtector(spec.e2e_data_id))
+        return CanFrame(spec.arbitration_id, protector.protect(self.catalogue.encode(name, values)), t_ns)
+
+    def safety(self, request: str, **values: float) -> CanFrame:
+        return self.frame("GW_SafetyCommand", {"SystemRequest": self.requests[request], **values})
+
+    def steering(self, angle_deg: float, enable: bool = True, mode: str = "AnglePosition", rate_dps: float = 2550.0) -> CanFrame:
+        modes = self.catalogue.enumeration("SR_Command", "Mode")
+        values = {"Mode": modes[mode], "Enable": enable, "AngleCommand": angle_deg, "RateLimit": rate_dps}
+        return self.frame("SR_Command", values)
+
+    def pedal(self, node: str, percent: float, enable: bool = True, rate_mmps: float = 2550.0) -> CanFrame:
+        name = f"{node}_Command"
+        mode = self.catalogue.enumeration(name, "Mode")["Position"]
+        return self.frame(name, {"Mode": mode, "Enable": enable, "PositionCommand": percent, "RateLimit": rate_mmps})
+
+    def frames(self, request: str, sr_deg: float = 0.0, ar_percent: float = 0.0, br_percent: float = 0.0) -> list[CanFrame]:
+        return [self.safety(request), self.steering(sr_deg), self.pedal("AR", ar_percent), self.pedal("BR", br_percent)]

@@ -1,0 +1,93 @@
+import gc
+import math
+import socket
+import threading
+import time
+from dataclasses import asdict
+
+import can
+import pytest
+
+from dbc.catalogue import load
+from dbc.link import LinkError
+from gateway import telemetry
+from vehicle_emulator import app
+from vehicle_emulator.app import EmulatorOptions, StepClock, world_sample
+from vehicle_emulator.emulator import STEP_NS, GroundTruth, StartPose
+
+MS_NS = 1_000_000
+
+
+def test_clock_makes_every_step_once_on_the_grid():
+    clock = StepClock(start_ns=7)
+    made = [step for now in (7, 7 + MS_NS - 1, 7 + MS_NS, 7 + 4 * MS_NS + 3, 7 + 4 * MS_NS + 4) for step in clock.due(now)]
+    assert made == [7 + k * MS_NS for k in (1, 2, 3, 4)]
+    assert clock.skipped == 0
+
+
+def test_clock_catches_up_after_a_short_stall_and_skips_after_a_long_one():
+    clock = StepClock(start_ns=0)
+    assert len(clock.due(50 * MS_NS)) == 50
+    assert clock.skipped == 0
+    steps = clock.due(500 * MS_NS)
+    assert list(steps) == [500 * MS_NS]
+    assert clock.skipped == 449
+    assert list(clock.due(501 * MS_NS)) == [501 * MS_NS]
+
+
+def test_world_sample_carries_the_truth_unchanged():
+    truth = GroundTruth(1.0, 2.0, 0.3, 4.0, 0.5, 0.6, 0.7, 0.8, 0.9, 0.11, 0.12, are_robots_engaged=True)
+    sample = world_sample(truth, t_ns=123, seq=4)
+    fields = asdict(truth)
+    assert sample.robots_engaged is fields.pop("are_robots_engaged")
+    assert {name: getattr(sample, name) for name in fields} == fields
+    assert (sample.t_ns, sample.seq, sample.objects) == (123, 4, [])
+
+
+def test_an_unknown_bus_is_refused_with_one_line():
+    with pytest.raises(LinkError, match="nosuch:bus0"):
+        app.run(EmulatorOptions("nosuch:bus0"), threading.Event())
+
+
+def free_base_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1]) - 2
+
+
+@pytest.fixture
+def base_port():
+    yield free_base_port()
+    gc.unfreeze()
+    gc.enable()
+
+
+def test_runs_in_real_time_on_a_bus_and_tells_the_world(base_port: int):
+    channel = f"emulator-{base_port}"
+    stop = threading.Event()
+    samples: list[telemetry.WorldSample] = []
+    options = EmulatorOptions(f"virtual:{channel}", start=StartPose(speed_mps=10.0), telemetry_base_port=base_port)
+    listener = can.Bus(channel=channel, interface="virtual")
+    worker = threading.Thread(target=app.run, args=(options, stop))
+    worker.start()
+    try:
+        with telemetry.Subscriber(lambda topic, payload: samples.append(telemetry.decode(topic, payload)), ["world"], base_port):
+            deadline_s = time.monotonic() + 10.0
+            while len(samples) < 25 and time.monotonic() < deadline_s:
+                time.sleep(0.02)
+    finally:
+        stop.set()
+        worker.join(timeout=10.0)
+    assert not worker.is_alive()
+    seen: set[int] = set()
+    while (message := listener.recv(timeout=0)) is not None:
+        seen.add(message.arbitration_id)
+    listener.shutdown()
+    assert seen == {spec.arbitration_id for spec in load().by_name.values() if spec.sender != "GW"}
+    assert len(samples) >= 25
+    first, last = samples[0], samples[-1]
+    assert last.vx_mps == pytest.approx(10.0, abs=0.1)
+    # 20 steps of 1 ms per sample, whatever the machine's clock does.
+    assert last.x_m - first.x_m == pytest.approx(10.0 * 0.020 * (last.seq - first.seq), rel=0.02)
+    assert (last.t_ns - first.t_ns) % STEP_NS == 0
+    assert math.isclose(last.y_m, 0.0)
