@@ -76,6 +76,7 @@ class PlantParameters(_Section):
     tyre_shape_c: Annotated[float, Field(ge=1.0, lt=2.0)]
     tyre_load_sensitivity: NotNegative
     tyre_nominal_load_n: Positive
+    front_compliance_radpn: NotNegative
     relaxation_length_m: Positive
     full_drive_force_n: Positive
     drag_torque_force_n: NotNegative

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from dbc.catalogue import Catalogue
+from dbc.catalogue import Catalogue, CatalogueError, EncodeError
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from gateway.limits import Demand, clamp
@@ -67,9 +67,19 @@ class Codec:
         catalogue.require(NEEDED_MESSAGES + COMMAND_MESSAGES, "gateway")
         self._catalogue = catalogue
         self._limits = limits
+        self._protectors: dict[str, E2EProtector] = {}
+        self._challenge = 0
+        try:
+            self._read_tables()
+            self._rehearse()
+        except (KeyError, EncodeError) as error:
+            raise CatalogueError(f"{', '.join(catalogue.sha256)}: not what the gateway needs: {error}") from error
         self._protectors = {
             spec.name: E2EProtector(spec.e2e_data_id) for spec in catalogue.by_name.values() if spec.e2e_data_id is not None
         }
+
+    def _read_tables(self) -> None:
+        catalogue = self._catalogue
         self._system_states = catalogue.enumeration("RC_SafetyStatus", "SystemState")
         self._stop_sources = {raw: name for name, raw in catalogue.enumeration("RC_SafetyStatus", "StopSource").items()}
         self._requests = catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
@@ -77,7 +87,13 @@ class Codec:
         self._usable_position_modes = {modes[name] for name in USABLE_POSITION_MODES}
         self._steer_modes = catalogue.enumeration("SR_Command", "Mode")
         self._pedal_modes = catalogue.enumeration("AR_Command", "Mode")
-        self._challenge = 0
+
+    def _rehearse(self) -> None:
+        """Use every signal and every table entry once, so that a site's DBC that lacks one is refused now, not on the road."""
+        self.update(Measurement(), {name: dict.fromkeys(self._catalogue.signals(name), 0.0) for name in NEEDED_MESSAGES})
+        for mode in Mode:
+            self.encode(0, mode, Demand(0.0, 0.0, 0.0), 0.0, is_navigation_valid=True)
+        self.encode_heartbeat(0, 0.0, 0)
 
     def update(self, measurement: Measurement, values: dict[str, dict[str, float]]) -> None:
         """Take the newest values of each message into the measurement."""

@@ -24,8 +24,6 @@ _CARCASS_DAMPING_RATIO = 0.3
 """Assumption. A tyre without slip is a spring; below about 5 m/s the slip alone would leave the car rocking for seconds."""
 _MAX_RELAXED_SLIP = 1.0
 """Far beyond the peak of the tyre; bounds what a sideways slide winds up."""
-_FRONT_COMPLIANCE_RADPN = 2.5e-6
-"""Assumption: steering and suspension give way by 0.14 degrees per kN; without it the car would be neutral, not understeering."""
 
 
 class PlantInputs(NamedTuple):
@@ -182,7 +180,7 @@ class FourWheelPlant:
         """Push, dry resistance to it, lateral force [N] and yaw moment [Nm] of the four tyres, in the car's axes."""
         p, state = self._p, self._state
         direction = state.vx_mps / max(abs(state.vx_mps), _STANDSTILL_MPS)
-        steer_rad = road_wheel_rad - _FRONT_COMPLIANCE_RADPN * self._front_lateral_n
+        steer_rad = road_wheel_rad - p.front_compliance_radpn * self._front_lateral_n
         steer_cosine, steer_sine = math.cos(steer_rad), math.sin(steer_rad)
         push_n = resist_n = across_n = yaw_moment_nm = front_lateral_n = 0.0
         for wheel in self._wheels:

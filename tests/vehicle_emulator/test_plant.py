@@ -111,7 +111,7 @@ def test_steady_cornering_has_the_gain_of_the_linear_bicycle(speed_mps: float):
         tyres_nprad = P.tyre_cornering_stiffness_per_load * load_n * falling
         return tyres_nprad / (1.0 + compliance_radpn * tyres_nprad)
 
-    front = axle_stiffness_nprad(P.cog_to_rear_m, 2.5e-6)
+    front = axle_stiffness_nprad(P.cog_to_rear_m, P.front_compliance_radpn)
     rear = axle_stiffness_nprad(P.cog_to_front_m, 0.0)
     understeer = P.mass_kg / wheelbase_m * (P.cog_to_rear_m / front - P.cog_to_front_m / rear)
     gain_per_s = speed_mps / (wheelbase_m + understeer * speed_mps**2)
