@@ -8,10 +8,11 @@ from pathlib import Path
 
 from dbc.catalogue import load
 from dbc.link import CanLink
+from dbc.realtime import GATEWAY_PRIORITY, become_realtime
 from dbc.vehicle import load_vehicle
 from gateway.channel import Channel
 from gateway.core import TICK_NS, GatewayCore
-from gateway.loop import PeriodicLoop, freeze_garbage_collector
+from gateway.loop import PeriodicLoop
 from gateway.messages import ControlCommand, OperatorRequest
 from gateway.samples import GatewaySampler
 from gateway.telemetry import Publisher, Source, new_boot_id
@@ -49,7 +50,8 @@ def run(options: GatewayOptions, stop: threading.Event) -> None:
         CanLink(options.bus_name) as link,
         Channel(options.gateway_socket, options.controller_socket) as channel,
     ):
-        freeze_garbage_collector()
+        if not become_realtime(GATEWAY_PRIORITY):
+            log.warning("no real-time priority: `xilgate doctor` says how to get it")
         loop = PeriodicLoop(TICK_NS)
         while not stop.is_set():
             now_ns = loop.wait()

@@ -1,6 +1,5 @@
 """The periodic loop of a real-time process: absolute deadlines, skipped rather than caught up with after a stall."""
 
-import gc
 import time
 
 
@@ -26,13 +25,3 @@ class PeriodicLoop:
         self.overruns += skipped
         self._deadline_ns += (skipped + 1) * self._period_ns
         return now_ns
-
-
-def freeze_garbage_collector() -> None:
-    """Take all objects made so far out of garbage collection and switch it off.
-
-    A full collection with the libraries of a process loaded takes 9 ms. Cores that run for ever make no cycles.
-    """
-    gc.collect()
-    gc.freeze()
-    gc.disable()

@@ -1,0 +1,1 @@
+"""The bench: everything around a run. It may import every other package; none imports it."""

@@ -1,0 +1,102 @@
+"""Three processes in real time on the emulated bus: a drive, and what happens when parts of it die."""
+
+import json
+import os
+import signal
+
+import pytest
+
+from gateway.telemetry import StateSample, Subscriber, decode
+from tests.support.processes import children, end, free_base_port, is_running, start_xilgate, wait_until
+
+EVERYONE = {"bus", "gateway", "controller", "emulator"}
+
+
+class Drive:
+    """A running `xilgate drive` and its newest state."""
+
+    def __init__(self, out):
+        port = free_base_port()
+        self.out = out
+        self.state = None
+        self._subscriber = Subscriber(self._receive, ["state"], port)
+        self.process = start_xilgate("drive", "--stage", "hil", "--bus", "emulated", "--out", str(out), "--telemetry-port", str(port))
+        self.children = {}
+
+    def _receive(self, topic, payload):
+        if isinstance(sample := decode(topic, payload), StateSample):
+            self.state = sample
+
+    def wait_for(self, condition, what):
+        def is_there():
+            assert self.process.poll() is None, self.process.communicate()[0]
+            return self.state is not None and condition(self.state)
+
+        wait_until(is_there, 60, what)
+        self.children = children(self.process.pid)
+
+    def is_gone(self):
+        return not any(map(is_running, self.children.values()))
+
+    def summary(self):
+        return json.loads((self.out / "summary.json").read_text())
+
+    def close(self):
+        end(self.process)
+        self._subscriber.close()
+
+
+@pytest.fixture
+def drive(tmp_path):
+    running = Drive(tmp_path)
+    yield running
+    running.close()
+
+
+def in_manoeuvre(state):
+    return state.mode == "ENGAGED" and state.x_m > 20.0
+
+
+def test_the_double_lane_change_passes(drive):
+    drive.wait_for(in_manoeuvre, "the manoeuvre")
+    assert drive.children.keys() == EVERYONE
+    output, _ = drive.process.communicate(timeout=90)
+    assert drive.process.returncode == 0, output
+    summary = drive.summary()
+    assert summary["verdict"] == "pass"
+    assert summary["solver"] == "casadi-c"
+    assert {"controller library", "robots.dbc", "gnss_imu.dbc", "configuration"} <= summary["sha256"].keys()
+    assert drive.is_gone()
+    assert (drive.out / "bus.log").read_text().count("\n") > 20_000
+
+
+def test_a_killed_controller_stops_the_car_and_is_named(drive):
+    drive.wait_for(in_manoeuvre, "the manoeuvre")
+    os.kill(drive.children["controller"], signal.SIGKILL)
+    wait_until(lambda: drive.state.mode == "SAFE_STOP", 5, "the safe stop")
+    wait_until(lambda: abs(drive.state.vx_mps) < 0.15, 30, "standstill")
+    output, _ = drive.process.communicate(timeout=60)
+    assert drive.process.returncode == 1, output
+    reason = drive.summary()["reason"]
+    assert "controller" in reason
+    assert "SIGKILL" in reason
+    assert drive.is_gone()
+
+
+def test_a_killed_gateway_stops_the_car_and_is_named(drive):
+    drive.wait_for(in_manoeuvre, "the manoeuvre")
+    os.kill(drive.children["gateway"], signal.SIGKILL)
+    output, _ = drive.process.communicate(timeout=60)
+    assert drive.process.returncode == 1, output
+    assert "gateway died" in drive.summary()["reason"]
+    assert drive.is_gone()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_no_process_survives_its_runner(drive, number):
+    drive.wait_for(lambda state: state.mode == "ENGAGED", "the engagement")
+    assert drive.children.keys() == EVERYONE
+    drive.process.send_signal(number)
+    drive.process.communicate(timeout=20)
+    assert drive.process.returncode == (-9 if number is signal.SIGKILL else 130)
+    wait_until(drive.is_gone, 5, "the end of every process")

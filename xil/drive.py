@@ -1,0 +1,159 @@
+"""`xilgate drive`: set up, drive on the stage that was asked for, judge, report."""
+
+import json
+import shutil
+import time
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from rich.console import Console
+from rich.status import Status
+
+from controller.build import build
+from controller.problem import OcpOptions
+from controller.solvers import SOLVERS, make_solver
+from dbc.catalogue import load
+from dbc.errors import UserMistake
+from dbc.vehicle import load_vehicle
+from gateway.limits import PROVING_GROUND
+from gateway.telemetry import StateSample
+from xil.bus import choose
+from xil.lockstep import START_NS, LockstepRun
+from xil.metrics import Verdict, evaluate
+from xil.realtime import RealtimeRun
+from xil.recording import Recording
+from xil.report import write_report
+from xil.scenario import Stage, load_scenario, scenario_path
+from xil.setup import RunSetup
+from xil.summary import RunFacts, build_summary
+
+COMPILED_SOLVER = "casadi-c"
+SOLVER_OF_STAGE = {Stage.MIL: "casadi-vm", Stage.SIL: COMPILED_SOLVER, Stage.HIL: COMPILED_SOLVER, Stage.VEHIL: COMPILED_SOLVER}
+"""MiL runs the controller as it was modelled; from SiL on it is the compiled library."""
+
+
+@dataclass(frozen=True)
+class DriveOptions:
+    """What the user asked for.
+
+    Args:
+        solver: name, or None for what the stage stands for.
+        view_port: port of the virtual world's page, or None for no page.
+    """
+
+    scenario: str
+    stage: Stage
+    bus: str
+    solver: str | None
+    seed: int
+    out: Path
+    view_port: int | None
+    dbc_paths: tuple[Path, ...]
+    vehicle_path: Path
+    telemetry_base_port: int
+
+
+class Display:
+    """What a run shows while it goes on: one live line on a terminal, changes of mode elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._status: Status | None = None
+        self._mode = ""
+
+    def announce(self, text: str) -> None:
+        """Print a line that stays."""
+        self._console.print(text, highlight=False)
+
+    def progress(self, state: StateSample | None) -> None:
+        """Show the newest state; None ends the live line."""
+        if state is None:
+            if self._status is not None:
+                self._status.stop()
+            return
+        if state.mode != self._mode:
+            self._mode = state.mode
+            self.announce(f"  x {state.x_m:7.1f} m  {state.vx_mps * 3.6:5.1f} km/h  {state.mode}")
+        if self._console.is_terminal:
+            if self._status is None:
+                self._status = self._console.status("")
+                self._status.start()
+            self._status.update(f"{state.mode}  x {state.x_m:7.1f} m  y {state.y_m:6.2f} m  {state.vx_mps * 3.6:5.1f} km/h")
+
+
+def run_drive(options: DriveOptions) -> Verdict:
+    """One run: files in `options.out`, a verdict on the console.
+
+    Raises:
+        UserMistake: something asked for is not to be had.
+        SetupFailure: the machine or its set-up does not allow the run.
+    """
+    display = Display(Console(stderr=True))
+    setup = _prepare(options, display)
+    started, start_s = datetime.now(UTC), time.monotonic()
+    display.announce(f"driving {setup.scenario.name} at stage {setup.stage.value} with {setup.solver}")
+    if setup.stage.is_lockstep:
+        recording = Recording(START_NS)
+        solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(), display.announce)
+        interruption = LockstepRun(setup, solver, recording, display.progress).drive()
+    else:
+        recording = Recording(time.monotonic_ns())
+        interruption = RealtimeRun(setup, recording, display.announce, display.progress).drive()
+    verdict = evaluate(recording, setup.scenario, setup.vehicle, setup.stage, interruption)
+    summary = build_summary(_facts(setup, options, started, time.monotonic() - start_s), verdict)
+    (setup.directory / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
+    write_report(setup.directory / "report.html", summary, recording, setup.scenario, setup.vehicle, verdict)
+    display.announce(f"[bold {'green' if verdict.passed else 'red'}]{'PASS' if verdict.passed else 'FAIL'}[/]  {verdict.reason}")
+    display.announce(f"report: {setup.directory / 'report.html'}")
+    return verdict
+
+
+def _prepare(options: DriveOptions, display: Display) -> RunSetup:
+    """Work out everything that can be wrong before anything starts."""
+    scenario = load_scenario(options.scenario)
+    vehicle = load_vehicle(options.vehicle_path)
+    catalogue = load(options.dbc_paths)
+    solver = options.solver or SOLVER_OF_STAGE[options.stage]
+    if solver not in SOLVERS:
+        raise UserMistake(f"solver {solver!r}: there are {', '.join(SOLVERS)}")
+    if options.stage is Stage.VEHIL and options.bus in ("auto", "emulated"):
+        raise UserMistake("stage vehil drives the car on a bus: name it with --bus, for example --bus socketcan:can0")
+    bus = None if options.stage.is_lockstep else choose(options.bus)
+    reference = scenario.reference(vehicle)
+    library = build(vehicle.model, OcpOptions(), display.announce) if solver == COMPILED_SOLVER else None
+    setup = RunSetup(
+        scenario, options.stage, vehicle, catalogue, solver, library, bus, options.seed, options.out,
+        options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port,
+    )  # fmt: skip
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(scenario_path(options.scenario), setup.directory / "scenario.toml")
+        reference.to_csv(setup.reference_csv)
+        setup.configuration.write_text(json.dumps(_configuration(setup), indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise UserMistake(f"run directory {options.out}: {error.strerror or error}") from error
+    return setup
+
+
+def _configuration(setup: RunSetup) -> dict[str, object]:
+    """The effective configuration: everything that was chosen, and everything that was taken as usual."""
+    return {
+        "stage": setup.stage.value,
+        "seed": setup.seed,
+        "solver": setup.solver,
+        "bus": setup.bus.name if setup.bus else "lockstep",
+        "dbc": [str(path) for path in setup.dbc_paths],
+        "vehicle": setup.vehicle.model_dump(),
+        "ocp": asdict(OcpOptions()),
+        "limits": asdict(PROVING_GROUND),
+    }
+
+
+def _facts(setup: RunSetup, options: DriveOptions, started: datetime, duration_s: float) -> RunFacts:
+    files = {path.name: path for path in setup.dbc_paths}
+    files |= {"vehicle": setup.vehicle_path, "scenario": scenario_path(options.scenario), "configuration": setup.configuration}
+    if setup.build is not None:
+        files["controller library"] = setup.build.library
+    compiler = setup.build.compiler if setup.build else ""
+    return RunFacts(setup.scenario, setup.stage, setup.seed, setup.solver, started, duration_s, compiler, files)

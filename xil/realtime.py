@@ -1,0 +1,169 @@
+"""Stages hil and vehil: every process on its own, in real time. The runner starts them, plays the operator, and ends them."""
+
+import contextlib
+import signal
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from dbc.errors import SetupFailure
+from gateway.channel import Channel
+from gateway.messages import OperatorRequest
+from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, decode, new_boot_id
+from vehicle_emulator.bus.channel import is_served
+from xil.buslog import BusListener
+from xil.operator import Advice, Ending, Operator
+from xil.processes import Death, Processes
+from xil.recording import Recording
+from xil.scenario import Stage
+from xil.setup import RunSetup
+
+START_TIMEOUT_S = 30.0
+POLL_S = 0.02
+SCENE_PERIOD_NS = 1_000_000_000
+LINGER_S = 0.3
+"""Time after the end in which the last samples arrive [s]."""
+SILENCE_S = 5.0
+"""A run without any state for this long is over, whatever caused it [s]."""
+SILENT = "no state of the car any more"
+INDISPENSABLE = {"bus", "emulator"}
+"""Without these there is no car left to watch."""
+
+Progress = Callable[[StateSample | None], None]
+
+
+class RealtimeRun:
+    """One run in real time; `drive` does it."""
+
+    def __init__(self, setup: RunSetup, recording: Recording, announce: Callable[[str], None], progress: Progress) -> None:
+        self._setup = setup
+        self._recording = recording
+        self._announce = announce
+        self._progress = progress
+        self._deaths: dict[str, Death] = {}
+        self._boot_id = new_boot_id()
+        self._requests = 0
+        self._scene = setup.scenario.scene(setup.stage, setup.vehicle, 0, 0)
+        self._next_scene_ns = 0
+
+    def drive(self) -> str:
+        """Start everything, drive, end everything.
+
+        Returns:
+            Why the run was cut short, for people; empty when it was not.
+
+        Raises:
+            SetupFailure: a process does not come up.
+        """
+        setup = self._setup
+        topics = [topic for topic, (source, _) in TOPICS.items() if source is not Source.RUNNER]
+        with contextlib.ExitStack() as stack:
+            sockets = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xilgate-")))
+            scene = stack.enter_context(Publisher(Source.RUNNER, setup.telemetry_base_port))
+            processes = stack.enter_context(Processes(setup.directory))
+            stack.enter_context(Subscriber(self._receive, topics, setup.telemetry_base_port))
+            self._bring_up(stack, processes, sockets / "gateway", sockets / "controller")
+            channel = stack.enter_context(Channel(None, str(sockets / "gateway")))
+            return self._operate(processes, channel, scene)
+
+    def _receive(self, topic: str, payload: bytes) -> None:
+        if (sample := decode(topic, payload)) is not None:
+            self._recording.add(sample)
+
+    def _bring_up(self, stack: contextlib.ExitStack, processes: Processes, gateway_socket: Path, controller_socket: Path) -> None:
+        setup, bus = self._setup, self._setup.bus
+        if bus is None:
+            raise ValueError("a real-time stage needs a bus")
+        telemetry = ["--telemetry-port", str(setup.telemetry_base_port)]
+        vehicle = ["--vehicle", str(setup.vehicle_path)]
+        contract = [*vehicle, *(argument for path in setup.dbc_paths for argument in ("--dbc", str(path))), *telemetry]
+        sockets = ["--gateway-socket", str(gateway_socket), "--controller-socket", str(controller_socket)]
+        if (channel := bus.hub_channel) is not None:
+            processes.start("bus", ["bus", channel])
+            self._await(processes, "bus", lambda: is_served(channel))
+        stack.enter_context(BusListener(bus.name, setup.bus_log))
+        if setup.view_port is not None:
+            processes.start("view", ["view", "--port", str(setup.view_port), *telemetry])
+            self._announce(f"virtual world: http://127.0.0.1:{setup.view_port}/")
+        processes.start("gateway", ["gateway", "--bus", bus.name, *contract, *sockets])
+        reference = ["--reference", str(setup.reference_csv), "--solver", setup.solver]
+        processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets])
+        # The car starts last: in a rolling start every second counts that the others take to come up.
+        self._await(processes, "gateway", lambda: self._recording.latest("status") is not None)
+        self._await(processes, "controller", controller_socket.exists)
+        if setup.stage is Stage.HIL:
+            pose = setup.scenario.start_pose
+            start = ["--x-m", str(pose.x_m), "--y-m", str(pose.y_m), "--yaw-rad", str(pose.yaw_rad), "--speed-mps", str(pose.speed_mps)]
+            processes.start("emulator", ["emulator", "--bus", bus.name, *start, "--seed", str(setup.seed), *contract])
+            self._await(processes, "emulator", lambda: self._recording.latest("world") is not None)
+
+    def _await(self, processes: Processes, name: str, is_up: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while not is_up():
+            if deaths := processes.deaths():
+                raise SetupFailure(f"{deaths[0].name} ended while starting: {deaths[0].last_words}")
+            if time.monotonic() > deadline:
+                raise SetupFailure(f"{name} did not come up within {START_TIMEOUT_S:.0f} s")
+            time.sleep(POLL_S)
+
+    def _operate(self, processes: Processes, channel: Channel, scene: Publisher) -> str:
+        """Play the operator until the run is over; why it was cut short, or nothing."""
+        operator = Operator(self._setup.scenario.time_limit_s)
+        ending, seen, last_news_s = None, 0, time.monotonic()
+        try:
+            while ending is None:
+                time.sleep(POLL_S)
+                self._note_deaths(processes)
+                self._post_scene(scene)
+                states = [state for state in self._recording.samples("state")[seen:] if isinstance(state, StateSample)]
+                seen += len(states)
+                last_news_s = time.monotonic() if states else last_news_s
+                if time.monotonic() - last_news_s > SILENCE_S or self._deaths.keys() & INDISPENSABLE:
+                    return self._interruption(SILENT)
+                ending = self._follow_advice(operator, states, channel)
+            time.sleep(LINGER_S)
+        finally:
+            self._progress(None)
+        if ending is Ending.NEVER_READY:
+            blockers = self._recording.texts("status", "blockers")
+            raise SetupFailure("the gateway never became ready: " + ", ".join(blockers[-1] if blockers else ["no status"]))
+        return self._interruption("" if ending in (Ending.COMPLETED, Ending.STOPPED) else ending.value)
+
+    def _follow_advice(self, operator: Operator, states: list[StateSample], channel: Channel) -> Ending | None:
+        """Let the operator see every new state, pass the last request on, and say whether the run is over."""
+        advice = Advice()
+        for state in states:
+            self._progress(state)
+            advice = operator.advise(state)
+            if advice.ending is not None:
+                break
+        if advice.operation is not None:
+            self._requests += 1
+            channel.send(OperatorRequest(self._boot_id, self._requests, advice.operation))
+        return advice.ending
+
+    def _post_scene(self, publisher: Publisher) -> None:
+        now_ns = time.monotonic_ns()
+        if now_ns >= self._next_scene_ns:
+            self._next_scene_ns = now_ns + SCENE_PERIOD_NS
+            self._scene = msgspec.structs.replace(self._scene, t_ns=now_ns, seq=self._scene.seq + 1)
+            publisher.post(self._scene)
+
+    def _note_deaths(self, processes: Processes) -> None:
+        for death in processes.deaths():
+            if death.name not in self._deaths:
+                self._deaths[death.name] = death
+                self._announce(f"{death.name} ended: {_describe(death)}")
+
+    def _interruption(self, ending: str) -> str:
+        """Why the run was cut short: processes that died, then how it ended."""
+        return "; ".join([f"{death.name} died ({_describe(death)})" for death in self._deaths.values()] + ([ending] if ending else []))
+
+
+def _describe(death: Death) -> str:
+    if death.exit_code < 0:
+        return f"killed by {signal.Signals(-death.exit_code).name}"
+    return f"exit code {death.exit_code}: {death.last_words}"
