@@ -71,7 +71,14 @@ class StateSample(Sample, frozen=True, kw_only=True):
 
 
 class CommandSample(Sample, frozen=True, kw_only=True):
-    """One command of the controller and how the solver came to it."""
+    """One command of the controller and how the solver came to it.
+
+    Args:
+        lateral_error_m: distance to the left of the path [m].
+        speed_error_mps: speed above the reference [m/s].
+        sqp_iterations: -1 where the solver does not tell.
+        primal_residual, dual_residual: -1 when nothing finite was solved.
+    """
 
     state_seq: int
     status: str
@@ -171,6 +178,7 @@ class SceneSample(Sample, frozen=True, kw_only=True):
     car_length_m: float
     car_width_m: float
     car_front_m: float
+    steering_ratio: float
     reference_x_m: list[float]
     reference_y_m: list[float]
     left_x_m: list[float]

@@ -20,7 +20,7 @@ ALLOWED_IMPORTS = {
     "gateway": ("dbc",),
     "controller": ("dbc", "gateway.messages", "gateway.telemetry", "gateway.channel", "gateway.loop"),
     "vehicle_emulator": ("dbc", "gateway.telemetry"),
-    "visualiser": ("gateway.telemetry",),
+    "visualiser": ("dbc.errors", "gateway.telemetry"),
     "xil": ("dbc", "gateway", "controller", "vehicle_emulator", "visualiser"),
 }
 

@@ -299,6 +299,7 @@ class Scenario(_Section):
         return SceneSample(
             t_ns=t_ns, seq=seq, scenario=self.name, stage=stage.value,
             car_length_m=vehicle.body.length_m, car_width_m=vehicle.body.width_m, car_front_m=course.outline.front_m,
+            steering_ratio=vehicle.steering.ratio,
             reference_x_m=course.reference.x_m[thin].tolist(), reference_y_m=course.reference.y_m[thin].tolist(),
             left_x_m=left_x_m, left_y_m=left_y_m, right_x_m=right_x_m, right_y_m=right_y_m, lanes=course.lanes,
         )
