@@ -196,7 +196,7 @@ def view(
     port: Annotated[int, typer.Option(min=1024, max=65535, help="port of the page")] = 8080, telemetry_port: PortOption = DEFAULT_BASE_PORT
 ) -> None:
     """Serve the virtual world to a browser."""
-    print(f"http://127.0.0.1:{port}/")
+    print(f"http://127.0.0.1:{port}/", flush=True)
     _run_daemon("visualiser.bridge", lambda m: m.ViewOptions(port=port, telemetry_base_port=telemetry_port))
 
 

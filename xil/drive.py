@@ -74,7 +74,7 @@ class Display:
             return
         if state.mode != self._mode:
             self._mode = state.mode
-            self.announce(f"  x {state.x_m:7.1f} m  {state.vx_mps * 3.6:5.1f} km/h  {state.mode}")
+            self.announce(f"  x {state.x_m:7.1f} m  {abs(state.vx_mps) * 3.6:5.1f} km/h  {state.mode}")
         if self._console.is_terminal:
             if self._status is None:
                 self._status = self._console.status("")

@@ -6,8 +6,10 @@ import signal
 
 import pytest
 
+from gateway.conditions import MAX_TICK_GAP_NS
 from gateway.telemetry import StateSample, Subscriber, decode
 from tests.support.processes import children, end, free_base_port, is_running, start_xilgate, wait_until
+from tests.support.stall import StallProbe
 
 EVERYONE = {"bus", "gateway", "controller", "emulator"}
 
@@ -57,17 +59,34 @@ def in_manoeuvre(state):
     return state.mode == "ENGAGED" and state.x_m > 20.0
 
 
-def test_the_double_lane_change_passes(drive):
-    drive.wait_for(in_manoeuvre, "the manoeuvre")
-    assert drive.children.keys() == EVERYONE
-    output, _ = drive.process.communicate(timeout=90)
-    assert drive.process.returncode == 0, output
-    summary = drive.summary()
+def trial(out):
+    """One drive to its end: exit code, output, longest stall of the machine meanwhile."""
+    drive = Drive(out)
+    try:
+        with StallProbe() as probe:
+            drive.wait_for(lambda state: state.mode != "STANDBY", "readiness")
+            assert drive.children.keys() == EVERYONE
+            output, _ = drive.process.communicate(timeout=90)
+        assert drive.is_gone()
+        return drive.process.returncode, output, probe.worst_s
+    finally:
+        drive.close()
+
+
+def test_the_double_lane_change_passes(tmp_path):
+    for attempt in range(3):
+        out = tmp_path / str(attempt)
+        code, output, stall_s = trial(out)
+        # A failure counts, unless the machine stood still for as long as the gateway must not: then it proves nothing.
+        if code == 0 or stall_s < MAX_TICK_GAP_NS * 1e-9 / 2:
+            break
+        print(f"attempt {attempt} inconclusive: the machine stood still for {stall_s * 1e3:.0f} ms")
+    assert code == 0, output
+    summary = json.loads((out / "summary.json").read_text())
     assert summary["verdict"] == "pass"
     assert summary["solver"] == "casadi-c"
     assert {"controller library", "robots.dbc", "gnss_imu.dbc", "configuration"} <= summary["sha256"].keys()
-    assert drive.is_gone()
-    assert (drive.out / "bus.log").read_text().count("\n") > 20_000
+    assert (out / "bus.log").read_text().count("\n") > 20_000
 
 
 def test_a_killed_controller_stops_the_car_and_is_named(drive):
