@@ -1,0 +1,209 @@
+"""Builds the controller's library: CasADi writes C, a C compiler makes a shared library, a cache keeps it by content.
+
+The key of the cache is a hash of all that goes in: sources of model and problem, their numbers, CasADi's version, compiler and
+flags. A hit needs neither CasADi nor a compiler run.
+"""
+
+import contextlib
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from controller.problem import OcpOptions
+from dbc.errors import SetupFailure
+from dbc.vehicle import ModelParameters
+
+LIBRARY_NAME = "nmpc.so"
+METADATA_NAME = "nmpc.json"
+SOURCE_NAME = "nmpc.c"
+
+MAX_SOLVERS = 64
+"""Solvers that one process can hold; each costs the generated code a few hundred bytes."""
+FLAGS = (
+    "-std=c11",
+    "-O3",
+    "-fPIC",
+    "-shared",
+    "-ffp-contract=off",
+    "-fvisibility=hidden",
+    '-DCASADI_SYMBOL_EXPORT=__attribute__((visibility("default")))',
+    f"-DCASADI_MAX_NUM_THREADS={MAX_SOLVERS}",
+)
+"""No -march, no contraction, no -ffast-math: the same numbers on every machine, and NaN stays NaN. Hidden functions can be inlined."""
+_COMPILERS = ("cc", "gcc", "clang")
+_ZIG_FLAGS = ("-mcpu=baseline", "-fno-sanitize=undefined")
+"""Zig compiles for the very machine it runs on, and with checks, unless told otherwise."""
+
+_KEYED_SOURCES = ("build.py", "codegen.py", "integrator.py", "model.py", "ocp.py", "problem.py")
+
+
+class BuildError(SetupFailure):
+    """The library cannot be built; one line that says why."""
+
+
+@dataclass(frozen=True)
+class Compiler:
+    """A C compiler.
+
+    Args:
+        command: how to call it.
+        version: first line of what it says of itself.
+    """
+
+    command: tuple[str, ...]
+    version: str
+
+    def __str__(self) -> str:
+        return f"{' '.join(Path(part).name for part in self.command)} ({self.version})"
+
+
+@dataclass(frozen=True)
+class Build:
+    """A library, ready to load.
+
+    Args:
+        sha256: of the library file.
+        compiler: which made it.
+        seconds: that making it took, now or when it was cached.
+        was_cached: whether it was found in the cache.
+    """
+
+    library: Path
+    sha256: str
+    compiler: str
+    seconds: float
+    was_cached: bool
+
+
+def find_compiler() -> Compiler:
+    """The C compiler of this machine: $CC, else cc, gcc or clang, else the one in the Python package ziglang.
+
+    Raises:
+        BuildError: there is none, or $CC does not run.
+    """
+    if chosen := os.environ.get("CC", "").split():
+        if version := _version_of(tuple(chosen)):
+            return Compiler(tuple(chosen), version)
+        raise BuildError(f"the compiler in $CC does not run: {' '.join(chosen)}")
+    for name in _COMPILERS:
+        if (path := shutil.which(name)) and (version := _version_of((path,))):
+            return Compiler((path,), version)
+    if importlib.util.find_spec("ziglang") and (version := _version_of((sys.executable, "-m", "ziglang", "cc"))):
+        return Compiler((sys.executable, "-m", "ziglang", "cc", *_ZIG_FLAGS), version)
+    raise BuildError("no C compiler found: install gcc or clang, or `pip install ziglang`, or set CC")
+
+
+def cache_directory() -> Path:
+    """Where built libraries are kept: $XDG_CACHE_HOME/xilgate, else ~/.cache/xilgate."""
+    root = os.environ.get("XDG_CACHE_HOME", "")
+    return (Path(root) if Path(root).is_absolute() else Path.home() / ".cache") / "xilgate"
+
+
+def build(car: ModelParameters, options: OcpOptions, progress: Callable[[str], None]) -> Build:
+    """The library for one car and one problem, from the cache or new.
+
+    Args:
+        progress: told in one line each what takes time.
+
+    Raises:
+        BuildError: no compiler, no place to write, or the compiler refuses.
+    """
+    compiler = find_compiler()
+    directory = cache_directory() / _key(car, options, compiler)
+    if found := _load(directory):
+        return found
+    try:
+        directory.parent.mkdir(parents=True, exist_ok=True)
+        # Built beside its final place and renamed, so that nobody ever sees half a library.
+        work = Path(tempfile.mkdtemp(dir=directory.parent, prefix="building-"))
+        try:
+            _make(work, car, options, compiler, progress)
+            _publish(work, directory)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+    except OSError as error:
+        raise BuildError(f"cannot write the library cache {directory.parent}: {error.strerror or error}") from error
+    if made := _load(directory):
+        return Build(made.library, made.sha256, made.compiler, made.seconds, was_cached=False)
+    raise BuildError(f"the library cache {directory} does not keep what is written to it")
+
+
+def _make(work: Path, car: ModelParameters, options: OcpOptions, compiler: Compiler, progress: Callable[[str], None]) -> None:
+    start = time.monotonic()
+    progress("generating C code of the controller")
+    from controller.codegen import generate  # noqa: PLC0415 - CasADi is loaded only when there is something to build
+
+    generate(work / SOURCE_NAME, car, options)
+    progress(f"compiling the controller with {compiler}")
+    command = [*compiler.command, *FLAGS, SOURCE_NAME, "-o", LIBRARY_NAME, "-lm"]
+    finished = subprocess.run(command, cwd=work, capture_output=True, text=True, check=False)
+    if finished.returncode != 0:
+        lines = [line for line in finished.stderr.splitlines() if "error" in line] or finished.stderr.splitlines() or ["no message"]
+        raise BuildError(f"{compiler} failed with exit code {finished.returncode}: {lines[0].strip()}")
+    metadata = {
+        "sha256": _sha256(work / LIBRARY_NAME),
+        "compiler": str(compiler),
+        "flags": FLAGS,
+        "casadi": importlib.metadata.version("casadi"),
+        "seconds": round(time.monotonic() - start, 1),
+        "model": car.model_dump(),
+        "options": options.generated(),
+    }
+    (work / METADATA_NAME).write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
+
+
+def _publish(work: Path, directory: Path) -> None:
+    if _load(directory):
+        return  # another process was faster
+    shutil.rmtree(directory, ignore_errors=True)
+    try:
+        work.rename(directory)
+    except OSError:
+        if not _load(directory):
+            raise
+
+
+def _load(directory: Path) -> Build | None:
+    """What the cache holds, or None when it is not there or not whole."""
+    library = directory / LIBRARY_NAME
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        metadata = json.loads((directory / METADATA_NAME).read_text(encoding="utf-8"))
+        if metadata["sha256"] == _sha256(library):
+            return Build(library, metadata["sha256"], metadata["compiler"], metadata["seconds"], was_cached=True)
+    return None
+
+
+def _key(car: ModelParameters, options: OcpOptions, compiler: Compiler) -> str:
+    sources = Path(__file__).parent
+    ingredients = {
+        "sources": {name: _sha256(sources / name) for name in _KEYED_SOURCES},
+        "model": car.model_dump(),
+        "options": options.generated(),
+        "casadi": importlib.metadata.version("casadi"),
+        "compiler": (compiler.command, compiler.version),
+        "machine": platform.machine(),
+    }
+    return hashlib.sha256(json.dumps(ingredients, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def _version_of(command: tuple[str, ...]) -> str:
+    try:
+        finished = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    except OSError:
+        return ""
+    return finished.stdout.splitlines()[0].strip() if finished.returncode == 0 and finished.stdout else ""
+
+
+def _sha256(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,0 +1,58 @@
+"""What the controller commands when a solve fails: the rest of the last good plan, for a while."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from controller.problem import Array
+from gateway.messages import CommandStatus
+
+MAX_DEGRADED_CYCLES = 3
+"""Cycles in a row that an old plan may stand in; after that the command says FAILED and the gateway stops the car."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A finite, converged plan.
+
+    Args:
+        t_ns: time from which the first input holds [ns].
+        states: shape (N+1, 6).
+        inputs: shape (N, 2).
+    """
+
+    t_ns: int
+    states: Array
+    inputs: Array
+
+    def from_time(self, now_ns: int, period_ns: int) -> "Plan":
+        """What is left of the plan at `now_ns`, its end held, in the same shape."""
+        passed = max(0, round((now_ns - self.t_ns) / period_ns))
+        left = [np.minimum(np.arange(len(rows)) + passed, len(rows) - 1) for rows in (self.states, self.inputs)]
+        return Plan(now_ns, self.states[left[0]], self.inputs[left[1]])
+
+
+class Fallback:
+    """Decides cycle by cycle which plan to command, and what to say of it.
+
+    Args:
+        period_ns: time between two inputs of a plan [ns].
+    """
+
+    def __init__(self, period_ns: int) -> None:
+        self._period_ns = period_ns
+        self._good: Plan | None = None
+        self._degraded_cycles = 0
+
+    def accept(self, plan: Plan) -> tuple[CommandStatus, Plan]:
+        """A good plan: command it."""
+        self._good, self._degraded_cycles = plan, 0
+        return CommandStatus.OK, plan
+
+    def substitute(self, now_ns: int, nothing_planned: Plan) -> tuple[CommandStatus, Plan]:
+        """No good plan in this cycle: the last one, shifted; `nothing_planned` when there never was one."""
+        self._degraded_cycles += 1
+        if self._good is None:
+            return CommandStatus.FAILED, nothing_planned
+        status = CommandStatus.DEGRADED if self._degraded_cycles <= MAX_DEGRADED_CYCLES else CommandStatus.FAILED
+        return status, self._good.from_time(now_ns, self._period_ns)

@@ -1,0 +1,107 @@
+"""The optimal control problem (5) of the paper as a nonlinear programme, by direct multiple shooting.
+
+The dynamics hold for k = 0 to N-1 (the paper's index runs to N, one too far). The corridor binds nodes 1 to N: node 0 is
+pinned to the measurement, which no constraint can move.
+"""
+
+from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any
+
+import casadi as ca
+
+from controller.integrator import Expression, rk4_step
+from controller.model import derivative
+from controller.problem import N_INPUTS, N_STATES, Layout, OcpOptions
+from dbc.vehicle import ModelParameters
+
+SOLVER_OPTIONS: dict[str, Any] = {
+    "qpsol": "qrqp",
+    "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "max_iter": 100, "error_on_fail": False},
+    "hessian_approximation": "exact",
+    "max_iter": 50,
+    "tol_pr": 1e-6,
+    "tol_du": 1e-4,
+    "print_header": False,
+    "print_iteration": False,
+    "print_status": False,
+    "print_time": False,
+    "error_on_fail": False,
+}
+"""The paper's solver: SQP with QRQP, exact Hessian, at most 50 and 100 iterations, thresholds 1e-6 and 1e-4."""
+
+
+@dataclass(frozen=True)
+class OcpFunctions:
+    """The three CasADi functions that a controller calls; `Layout` says what lies where.
+
+    Args:
+        nmpc: the solver, with the inputs and outputs of `casadi.nlpsol`.
+        kkt: (w, p, lam_g) to (g, gradient of f + lam_g' g), both dense.
+        advance: (x, u, duration_s) to the state after that time.
+    """
+
+    nmpc: Any
+    kkt: Any
+    advance: Any
+
+
+def stage_function(car: ModelParameters, options: OcpOptions) -> Expression:
+    """f_d of the paper: one sample of the model, (x, u) to the next x.
+
+    Model, step and stage are functions that call each other, so that the model's code, and that of its derivatives, is there
+    once and not sixteen times: the C compiler needs a quarter of the time, and the solver no more.
+    """
+    called = {"never_inline": True}
+    x_sx, u_sx = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS)
+    model = ca.Function("model", [x_sx, u_sx], [derivative(x_sx, u_sx, car)], ["x", "u"], ["dx"], called)
+    x, u = ca.MX.sym("x", N_STATES), ca.MX.sym("u", N_INPUTS)
+    x_next = rk4_step(model, x, u, options.sample_time_s / options.integrator_steps)
+    step = ca.Function("step", [x, u], [x_next], ["x", "u"], ["x_next"], called)
+    x_next = x
+    for _ in range(options.integrator_steps):
+        x_next = step(x_next, u)
+    return ca.Function("stage", [x, u], [x_next], ["x", "u"], ["x_next"])
+
+
+def advance_function(car: ModelParameters, options: OcpOptions) -> Expression:
+    """The same for a duration [s] that is an argument, (x, u, duration_s) to the x after it."""
+    x, u, duration = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("duration_s")
+    x_after = x
+    for _ in range(options.integrator_steps):
+        x_after = rk4_step(lambda x, u: derivative(x, u, car), x_after, u, duration / options.integrator_steps)
+    return ca.Function("advance", [x, u, duration], [x_after], ["x", "u", "duration_s"], ["x_after"])
+
+
+def build_functions(car: ModelParameters, options: OcpOptions) -> OcpFunctions:
+    """Write the programme down and make its functions."""
+    nlp = transcribe(car, options)
+    lam_g = ca.MX.sym("lam_g", nlp["g"].numel())
+    lagrangian_gradient = ca.gradient(nlp["f"] + ca.dot(lam_g, nlp["g"]), nlp["x"])
+    kkt_terms = [nlp["g"], ca.densify(lagrangian_gradient)]
+    kkt = ca.Function("kkt", [nlp["x"], nlp["p"], lam_g], kkt_terms, ["w", "p", "lam_g"], ["g", "gradient"])
+    return OcpFunctions(ca.nlpsol("nmpc", "sqpmethod", nlp, SOLVER_OPTIONS), kkt, advance_function(car, options))
+
+
+def transcribe(car: ModelParameters, options: OcpOptions) -> dict[str, Any]:
+    """The programme: decision variables `x`, parameters `p`, objective `f`, constraints `g`."""
+    N = options.horizon_steps
+    layout = Layout(N)
+    w = ca.MX.sym("w", layout.n_variables)
+    p = ca.MX.sym("p", layout.n_parameters)
+    nodes = ca.reshape(w[:-N_STATES], N_STATES + N_INPUTS, N)
+    x = ca.horzcat(nodes[:N_STATES, :], w[-N_STATES:])
+    u = nodes[N_STATES:, :]
+
+    ends = [0, *accumulate(layout.parameter_sizes)]
+    x_ref, normals, u_previous, Q, Q_N, R, S = ca.vertsplit(p, ends)
+    x_ref, normals = ca.reshape(x_ref, N_STATES, N + 1), ca.reshape(normals, 2, N)
+
+    error = x - x_ref
+    du = u - ca.horzcat(u_previous, u[:, :-1])
+    stage_cost = ca.dot(Q, ca.sum2(error[:, :-1] ** 2)) + ca.dot(R, ca.sum2(u**2)) + ca.dot(S, ca.sum2(du**2))
+    terminal_cost = ca.dot(Q_N, error[:, -1] ** 2)
+
+    gaps = stage_function(car, options).map(N)(x[:, :-1], u) - x[:, 1:]
+    lateral = ca.sum1(normals * error[3:5, 1:])
+    return {"x": w, "p": p, "f": stage_cost + terminal_cost, "g": ca.vertcat(ca.vec(gaps), ca.vec(lateral))}
