@@ -14,6 +14,10 @@ from controller.solver import Solver, SolveResult, SolveStatus
 from dbc.vehicle import Vehicle
 from gateway.messages import HORIZON_STEPS, PLAN_PERIOD_NS, ControlCommand, Mode, VehicleState
 
+_PLAUSIBLE_STATE = np.array((100.0, 50.0, 10.0, 1e6, 1e6, 1e6))
+"""Largest state that a car on a site can have; beyond it numbers are wrong, not large."""
+_PLAUSIBLE_INPUT = np.array((2.0, 10.0))
+
 
 @dataclass(frozen=True)
 class NmpcOptions:
@@ -125,8 +129,13 @@ class Nmpc:
         return NmpcOutput(command, plan, solution)
 
     def _is_usable(self, state: VehicleState, measured: Array, acting: Array, now_ns: int) -> bool:
-        is_fresh = -self._options.max_state_age_ns <= now_ns - state.t_ns <= self._options.max_state_age_ns
-        return state.is_valid and is_fresh and bool(np.isfinite(measured).all() and np.isfinite(acting).all())
+        is_fresh = abs(now_ns - state.t_ns) <= self._options.max_state_age_ns
+        # Comparisons with NaN are false.
+        return (
+            state.is_valid
+            and is_fresh
+            and bool((np.abs(measured) <= _PLAUSIBLE_STATE).all() and (np.abs(acting) <= _PLAUSIBLE_INPUT).all())
+        )
 
     def _is_in_time(self, result: SolveResult) -> bool:
         return self._options.deadline_ns is None or result.solve_time_ns <= self._options.deadline_ns

@@ -10,8 +10,6 @@ from dbc.vehicle import ModelParameters
 
 _RUN_OUT_M = 500.0
 """Straight line added beyond the last sample, with target speed zero: a car that arrives too fast brakes on it."""
-_STOP_STEP_M = 0.01
-"""Length over which the speed profile falls to zero there."""
 _CURVATURE_STEP_M = 1.0
 """Curvature is the turn of the path from this far behind to this far ahead: noise on a recorded heading does not matter."""
 
@@ -130,9 +128,8 @@ class Planner:
         options, path = self._options, self._path
         arc, speed = np.empty(self._horizon_steps + 1), np.empty(self._horizon_steps + 1)
         for k in range(self._horizon_steps + 1):
-            wanted = float(np.interp(arc_m, path.arc_length_m, path.speed_mps))
-            if arc_m < self._end_m:
-                wanted = max(wanted, options.crawl_mps)
+            profile = float(np.interp(arc_m, path.arc_length_m, path.speed_mps))
+            wanted = max(profile, options.crawl_mps) if arc_m < self._end_m else 0.0
             within = options.speed_margin_mps + options.acceleration_mps2 * k * self._sample_time_s
             arc[k], speed[k] = arc_m, max(0.0, min(max(wanted, v_x - within), v_x + within))
             arc_m += speed[k] * self._sample_time_s
@@ -172,11 +169,10 @@ def _stop_m(path: ReferencePath) -> float:
 
 def _with_run_out(path: ReferencePath) -> ReferencePath:
     heading = np.array((np.cos(path.yaw_rad[-1]), np.sin(path.yaw_rad[-1])))
-    ahead = np.array((_STOP_STEP_M, _RUN_OUT_M))
-    columns = {name: np.append(getattr(path, name), np.full(2, getattr(path, name)[-1])) for name in ("yaw_rad", "left_m", "right_m")}
+    columns = {name: np.append(getattr(path, name), getattr(path, name)[-1]) for name in ("yaw_rad", "left_m", "right_m")}
     return ReferencePath(
-        x_m=np.append(path.x_m, path.x_m[-1] + ahead * heading[0]),
-        y_m=np.append(path.y_m, path.y_m[-1] + ahead * heading[1]),
-        speed_mps=np.append(path.speed_mps, (0.0, 0.0)),
+        x_m=np.append(path.x_m, path.x_m[-1] + _RUN_OUT_M * heading[0]),
+        y_m=np.append(path.y_m, path.y_m[-1] + _RUN_OUT_M * heading[1]),
+        speed_mps=np.append(path.speed_mps, 0.0),
         **columns,
     )

@@ -166,10 +166,10 @@ class SqpSolver:
     def solve(self, state: Array, previous_input: Array, horizon: Horizon) -> SolveResult:
         """Plan from `state`; see `Solver`."""
         self._pack(state, previous_input, horizon)
-        if (cause := self._refusal()) is not None:
+        if (refusal := self._refusal()) is not None:
             self.warm_start = None
-            nothing = np.full(self._layout.n_variables, math.nan)
-            return self._result(cause, nothing, math.nan, math.nan, (None, None), 0)
+            self._buffers.w[:] = math.nan
+            return self._result(refusal, (math.nan, math.nan), (None, None), 0)
         start_ns = self._clock()
         iterations = self._back_end.solve()
         solve_time_ns = self._clock() - start_ns
@@ -181,7 +181,7 @@ class SqpSolver:
         else:
             status = SolveStatus.NOT_CONVERGED
         self.warm_start = None if status is SolveStatus.NOT_FINITE else self._shifted()
-        return self._result(status, self._buffers.w, primal, dual, iterations, solve_time_ns)
+        return self._result(status, (primal, dual), iterations, solve_time_ns)
 
     def advance(self, state: Array, inputs: Array, duration_s: float) -> Array:
         """State of the model after `duration_s` of constant input; see `Solver`."""
@@ -192,9 +192,10 @@ class SqpSolver:
         self.warm_start = None
 
     def _result(
-        self, status: SolveStatus, w: Array, primal: float, dual: float, iterations: tuple[int | None, int | None], solve_time_ns: int
+        self, status: SolveStatus, residuals: tuple[float, float], iterations: tuple[int | None, int | None], solve_time_ns: int
     ) -> SolveResult:
-        return SolveResult(status, w[self._layout.state_index], w[self._layout.input_index], primal, dual, *iterations, solve_time_ns)
+        w, layout = self._buffers.w, self._layout
+        return SolveResult(status, w[layout.state_index], w[layout.input_index], *residuals, *iterations, solve_time_ns)
 
     def _refusal(self) -> SolveStatus | None:
         """Why the packed problem is none: numbers that are not finite, or bounds that cross."""
