@@ -19,7 +19,7 @@ SHORTEST_STEP_M = 1e-6
 """Distance by which every sample must advance."""
 
 
-class ReferenceError(UserMistake):
+class ReferencePathError(UserMistake):
     """A reference path cannot be used; one line that says where and why."""
 
 
@@ -33,7 +33,7 @@ class ReferencePath:
         left_m, right_m: drivable distance to the left and to the right of the path at the centre of gravity [m], positive.
 
     Raises:
-        ReferenceError: a sample that breaks one of these rules, named by its row (from 1) and column.
+        ReferencePathError: a sample that breaks one of these rules, named by its row (from 1) and column.
     """
 
     x_m: Array
@@ -58,20 +58,20 @@ class ReferencePath:
         """Read a path written by `to_csv`, or by hand: a header with the names of the columns, then numbers.
 
         Raises:
-            ReferenceError: the file cannot be read, or its content breaks a rule.
+            ReferencePathError: the file cannot be read, or its content breaks a rule.
         """
         try:
             rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
         except (OSError, UnicodeDecodeError) as error:
-            raise ReferenceError(f"{path}: {error}") from error
+            raise ReferencePathError(f"{path}: {error}") from error
         if not rows or tuple(name.strip() for name in rows[0]) != _COLUMNS:
-            raise ReferenceError(f"{path}: the first line must be {','.join(_COLUMNS)}")
+            raise ReferencePathError(f"{path}: the first line must be {','.join(_COLUMNS)}")
         numbers = [[_number(path, i, name, text) for name, text in zip(_COLUMNS, _complete(path, i, row), strict=True)]
                    for i, row in enumerate(rows[1:], start=1)]  # fmt: skip
         try:
             return cls(*np.array(numbers, dtype=np.float64).reshape(-1, len(_COLUMNS)).T)
-        except ReferenceError as error:
-            raise ReferenceError(f"{path}: {error}") from error
+        except ReferencePathError as error:
+            raise ReferencePathError(f"{path}: {error}") from error
 
     def to_csv(self, path: Path) -> None:
         """Write the path so that `from_csv` gives back the very same numbers."""
@@ -85,9 +85,9 @@ def _validate(path: ReferencePath) -> None:
     n = path.x_m.size
     for name, values in columns.items():
         if values.shape != (n,):
-            raise ReferenceError(f"column {name}: shape {values.shape}, expected {(n,)} as x_m")
+            raise ReferencePathError(f"column {name}: shape {values.shape}, expected {(n,)} as x_m")
     if n < 2:
-        raise ReferenceError(f"{n} rows; a path needs at least 2")
+        raise ReferencePathError(f"{n} rows; a path needs at least 2")
     for name, values in columns.items():
         _refuse(name, values, ~np.isfinite(values), "must be finite")
     _refuse("speed_mps", path.speed_mps, path.speed_mps < 0.0, "must not be negative")
@@ -105,12 +105,12 @@ def _validate(path: ReferencePath) -> None:
 def _refuse(name: str, values: Array, is_bad: NDArray[np.bool_], rule: str) -> None:
     if is_bad.any():
         row = int(np.argmax(is_bad))
-        raise ReferenceError(f"row {row + 1}, column {name} = {values[row]:g}: {rule}")
+        raise ReferencePathError(f"row {row + 1}, column {name} = {values[row]:g}: {rule}")
 
 
 def _complete(path: Path, row: int, texts: list[str]) -> list[str]:
     if len(texts) != len(_COLUMNS):
-        raise ReferenceError(f"{path}: row {row}: {len(texts)} columns, expected {len(_COLUMNS)}")
+        raise ReferencePathError(f"{path}: row {row}: {len(texts)} columns, expected {len(_COLUMNS)}")
     return texts
 
 
@@ -118,4 +118,4 @@ def _number(path: Path, row: int, name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        raise ReferenceError(f"{path}: row {row}, column {name} = {text!r}: not a number") from error
+        raise ReferencePathError(f"{path}: row {row}, column {name} = {text!r}: not a number") from error

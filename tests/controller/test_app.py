@@ -7,7 +7,7 @@ import time
 import pytest
 
 from controller.app import ControllerOptions, run
-from controller.reference import ReferenceError
+from controller.reference import ReferencePathError
 from dbc.vehicle import FOCUS
 from gateway.channel import Channel
 from gateway.messages import CommandStatus, ControlCommand, Mode, VehicleState
@@ -50,5 +50,5 @@ def test_states_are_answered_until_told_to_stop(options, wavy_path):
 
 def test_a_missing_path_is_the_users_mistake(options, tmp_path):
     (tmp_path / "path.csv").unlink()
-    with pytest.raises(ReferenceError, match=r"path\.csv"):
+    with pytest.raises(ReferencePathError, match=r"path\.csv"):
         run(options, threading.Event())

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controller.reference import ReferenceError, ReferencePath
+from controller.reference import ReferencePath, ReferencePathError
 from dbc.errors import UserMistake
 
 GOOD = {
@@ -37,12 +37,12 @@ def test_arc_length():
     ],
 )
 def test_a_bad_sample_is_named(column, values, named):
-    with pytest.raises(ReferenceError, match=named):
+    with pytest.raises(ReferencePathError, match=named):
         ReferencePath(**{**GOOD, column: values})
 
 
 def test_one_sample_is_no_path():
-    with pytest.raises(ReferenceError, match="1 rows; a path needs at least 2"):
+    with pytest.raises(ReferencePathError, match="1 rows; a path needs at least 2"):
         ReferencePath(**{name: values[:1] for name, values in GOOD.items()})
 
 
@@ -79,5 +79,5 @@ def test_a_bad_file_is_named_with_the_row(tmp_path, text, named):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ReferenceError, match=r"none\.csv"):
+    with pytest.raises(ReferencePathError, match=r"none\.csv"):
         ReferencePath.from_csv(tmp_path / "none.csv")
