@@ -1,0 +1,49 @@
+#!/usr/bin/env bash
+# vcan_guest.sh COMMAND [ARG...]: run a command where there is a real SocketCAN interface vcan0.
+#
+# Many kernels, those of CI machines above all, have no CAN. User-mode Linux is a Linux kernel that runs as an ordinary program:
+# Debian's package user-mode-linux brings one with the CAN modules. The guest's file system is the host's (hostfs, read-write, same
+# paths), so that the checkout and its virtual environment are used as they are. Needs neither root nor /dev/kvm.
+# Exit status: the command's; 125 when the guest did not run it.
+set -u
+LIMIT_S=${VCAN_GUEST_LIMIT_S:-300}
+KERNEL=$(command -v linux.uml) || { echo "vcan_guest: no linux.uml; on Debian: apt-get install user-mode-linux" >&2; exit 125; }
+MODULES=/usr/lib/uml/modules/$("$KERNEL" --version)/kernel
+WORK=$(mktemp -d) || exit 125
+trap 'rm -rf "$WORK"' EXIT
+
+{ export -p; printf 'cd %q\nexec' "$PWD"; printf ' %q' "$@"; echo; } > "$WORK/command"
+
+cat > "$WORK/init" <<'INIT'
+#!/bin/bash
+# First process of the guest. guest_work and guest_modules come from the kernel command line.
+export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
+mount -t proc proc /proc; mount -t sysfs sys /sys
+mount -t tmpfs run /run; mkdir -p /dev/shm /dev/pts; mount -t tmpfs shm /dev/shm -o mode=1777; mount -t devpts pts /dev/pts
+ln -s /proc/self/fd /dev/fd 2>/dev/null
+for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/net/can/vcan; do
+  insmod "$guest_modules/$module.ko"
+done
+ip link set lo up; ip link add vcan0 type vcan && ip link set vcan0 up
+stty -F /dev/tty0 raw -echo
+mkfifo /run/output; cat /run/output > /dev/tty0 & reader=$!      # not a terminal, for what the command prints
+setsid bash "$guest_work/command" < /dev/null > /run/output 2>&1
+status=$?
+for _ in {1..40}; do kill -0 $reader 2>/dev/null || break; sleep 0.05; done
+echo $status > "$guest_work/status"
+sync; echo o > /proc/sysrq-trigger; sleep 9
+INIT
+chmod 700 "$WORK/init"
+
+mkfifo "$WORK/console"; cat < "$WORK/console" & READER=$!
+mkdir "$WORK/uml"
+# Unpinned, a system call of the guest costs two to three times as much.
+PIN=(taskset -c "$(($(nproc) - 1))")
+TMPDIR=$WORK timeout -k 3 "$LIMIT_S" "${PIN[@]}" "$KERNEL" mem=2G root=/dev/root rootfstype=hostfs rootflags=/ rw init="$WORK/init" \
+  guest_work="$WORK" guest_modules="$MODULES" uml_dir="$WORK/uml/" quiet con=null con0=null,fd:3 con1=null con2=null,fd:4 console=tty2 ssl=null \
+  < /dev/null 3> "$WORK/console" 4> "$WORK/kernel.log" > "$WORK/boot.log" 2>&1
+wait $READER
+[ -s "$WORK/status" ] && exit "$(cat "$WORK/status")"
+echo "vcan_guest: the guest did not finish within $LIMIT_S s or did not start:" >&2
+tail -n 20 "$WORK/boot.log" "$WORK/kernel.log" >&2
+exit 125
