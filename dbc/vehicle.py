@@ -20,7 +20,7 @@ class VehicleError(UserMistake):
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
 
 class Body(_Section):
@@ -159,7 +159,7 @@ def load_vehicle(path: Path = FOCUS) -> Vehicle:
     try:
         return Vehicle.model_validate(_without_sources(tree, str(path), ""))
     except ValidationError as error:
-        lines = (f"{path}: {'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
+        lines = (f"{path}: {'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors())
         raise VehicleError("\n".join(lines)) from error
 
 
@@ -174,7 +174,7 @@ def _without_sources(tree: dict[str, Any], path: str, prefix: str) -> dict[str, 
             plain[key] = entry["value"]
         elif isinstance(entry, dict):
             plain[key] = _without_sources(entry, path, f"{name}.")
-        elif isinstance(entry, str):
+        elif isinstance(entry, str) and not prefix:
             plain[key] = entry
         else:
             raise VehicleError(f"{path}: {name}: a number needs its source: {{ value = {entry}, source = \"...\" }}")

@@ -40,6 +40,9 @@ class Channel:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
         if bind is not None:
+            if _is_served(bind):
+                self._socket.close()
+                raise ChannelError(f"control socket {bind} is in use by another process; stop it, or choose another socket")
             try:
                 Path(bind).unlink(missing_ok=True)
                 self._socket.bind(bind)
@@ -86,3 +89,13 @@ class Channel:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _is_served(path: str) -> bool:
+    """Whether a living process listens on a socket; what a dead one left behind refuses the connection."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(path)
+        except OSError:
+            return False
+    return True

@@ -237,7 +237,9 @@ class Publisher:
         try:
             self._session = _session([f"tcp/127.0.0.1:{port}"], [])
         except zenoh.ZError as error:
-            raise TelemetryError(f"telemetry port {port} of the {source} is busy; is another run active?") from error
+            raise TelemetryError(
+                f"telemetry port {port} of the {source} is busy; is another run active? Choose another with --telemetry-port"
+            ) from error
         self._publishers = {
             topic: self._session.declare_publisher(f"{KEY_PREFIX}/{topic}", congestion_control=zenoh.CongestionControl.DROP)
             for topic, (owner, _) in TOPICS.items()

@@ -59,13 +59,15 @@ def bench_gateway(seconds: float, rounds: int) -> dict[str, Any]:
         "qp_iterations_mean": None,
         "converged": None,
     }
-    return {"machine": machine(), "rows": [row]}
+    facts = machine()
+    return {"machine": f"{facts['cpu']}, {facts['cores']} cores, {facts['system']}", "rows": [row]}
 
 
 def to_table(result: dict[str, Any]) -> Table:
     """The result for people."""
     row = result["rows"][0]
-    table = Table(title=f"CPU time of GatewayCore.step, {row['instances']} steps, {row['rounds']} rounds, {result['machine']['cpu']}")
+    caption = f"{row['instances']} steps, {row['rounds']} rounds, {result['machine']}"
+    table = Table(title="CPU time of one gateway step", caption=caption, width=60)
     for column in ("figure", "µs"):
         table.add_column(column, justify="left" if column == "figure" else "right")
     for key, value in row.items():

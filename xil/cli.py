@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +34,14 @@ app = typer.Typer(
 )
 bench = typer.Typer(help="Measure: every command prints a table, or with --json one object.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+
+class OperationName(StrEnum):
+    """What an operator can ask for."""
+
+    ENGAGE = "engage"
+    DISENGAGE = "disengage"
+    RESET = "reset"
+
 
 BusOption = Annotated[str, typer.Option("--bus", help="auto, emulated, socketcan:INTERFACE or xilgate:CHANNEL")]
 DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
@@ -179,6 +188,22 @@ def emulator(
             telemetry_base_port=telemetry_port,
         ),
     )
+
+
+@app.command()
+def operate(
+    operation: Annotated[OperationName, typer.Argument(help="what to ask of the gateway")],
+    gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
+) -> None:
+    """Ask a running gateway to engage, disengage or reset; `xilgate watch` shows what it makes of it."""
+    from gateway.channel import Channel  # noqa: PLC0415
+    from gateway.messages import Operation, OperatorRequest  # noqa: PLC0415
+    from gateway.telemetry import new_boot_id  # noqa: PLC0415
+
+    with Channel(None, gateway_socket) as channel:
+        channel.send(OperatorRequest(new_boot_id(), 1, Operation[operation.name]))
+        if channel.unsent:
+            raise SetupFailure(f"no gateway listens on {gateway_socket}")
 
 
 @app.command("bus")

@@ -1,8 +1,14 @@
 """`xilgate drive`: set up, drive on the stage that was asked for, judge, report."""
 
+import fcntl
 import json
+import os
 import shutil
+import signal
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,8 +20,9 @@ from controller.build import build
 from controller.problem import OcpOptions
 from controller.solvers import SOLVERS, make_solver
 from dbc.catalogue import load
-from dbc.errors import UserMistake
+from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import load_vehicle
+from gateway.core import GatewayCore
 from gateway.limits import PROVING_GROUND
 from gateway.telemetry import StateSample
 from xil.bus import choose
@@ -31,6 +38,8 @@ from xil.summary import RunFacts, build_summary
 COMPILED_SOLVER = "casadi-c"
 SOLVER_OF_STAGE = {Stage.MIL: "casadi-vm", Stage.SIL: COMPILED_SOLVER, Stage.HIL: COMPILED_SOLVER, Stage.VEHIL: COMPILED_SOLVER}
 """MiL runs the controller as it was modelled; from SiL on it is the compiled library."""
+OUTCOMES = ("summary.json", "report.html", "bus.log")
+"""What a run concludes with; the next one in the same directory starts without them."""
 
 
 @dataclass(frozen=True)
@@ -63,8 +72,8 @@ class Display:
         self._mode = ""
 
     def announce(self, text: str) -> None:
-        """Print a line that stays."""
-        self._console.print(text, highlight=False)
+        """Print a line that stays, as it is: names are the user's and may hold brackets."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def progress(self, state: StateSample | None) -> None:
         """Show the newest state; None ends the live line."""
@@ -72,7 +81,7 @@ class Display:
             if self._status is not None:
                 self._status.stop()
             return
-        if state.mode != self._mode:
+        if state.mode != self._mode and state.is_valid:
             self._mode = state.mode
             self.announce(f"  x {state.x_m:7.1f} m  {abs(state.vx_mps) * 3.6:5.1f} km/h  {state.mode}")
         if self._console.is_terminal:
@@ -91,12 +100,24 @@ def run_drive(options: DriveOptions) -> Verdict:
     """
     display = Display(Console(stderr=True))
     setup = _prepare(options, display)
+    try:
+        with _sole_use_of(setup.directory):
+            _write_inputs(setup, options)
+            return _run(setup, options, display)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise SetupFailure(f"{error.filename}: {error.strerror}") from error
+
+
+def _run(setup: RunSetup, options: DriveOptions, display: Display) -> Verdict:
     started, start_s = datetime.now(UTC), time.monotonic()
     display.announce(f"driving {setup.scenario.name} at stage {setup.stage.value} with {setup.solver}")
     if setup.stage.is_lockstep:
         recording = Recording(START_NS)
         solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(), display.announce)
-        interruption = LockstepRun(setup, solver, recording, display.progress).drive()
+        with _deferred_interrupt() as interrupted:
+            interruption = LockstepRun(setup, solver, recording, display.progress, interrupted.is_set).drive()
     else:
         recording = Recording(time.monotonic_ns())
         interruption = RealtimeRun(setup, recording, display.announce, display.progress).drive()
@@ -104,9 +125,38 @@ def run_drive(options: DriveOptions) -> Verdict:
     summary = build_summary(_facts(setup, options, started, time.monotonic() - start_s), verdict)
     (setup.directory / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     write_report(setup.directory / "report.html", summary, recording, setup.scenario, setup.vehicle, verdict)
-    display.announce(f"[bold {'green' if verdict.passed else 'red'}]{'PASS' if verdict.passed else 'FAIL'}[/]  {verdict.reason}")
-    display.announce(f"report: {setup.directory / 'report.html'}")
+    print(f"{'PASS' if verdict.passed else 'FAIL'}  {verdict.reason}")
+    print(f"report: {setup.directory / 'report.html'}")
     return verdict
+
+
+@contextmanager
+def _sole_use_of(directory: Path) -> Iterator[None]:
+    """Hold the run directory, empty of what an earlier run concluded: nobody is to find its verdict beside our record."""
+    directory.mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise UserMistake(f"run directory {directory} is in use by another run; choose another with --out") from None
+        for name in OUTCOMES:
+            (directory / name).unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _deferred_interrupt() -> Iterator[threading.Event]:
+    """Note SIGINT and SIGTERM instead of raising: CasADi would turn the exception into another one, or lose it."""
+    interrupted = threading.Event()
+    before = {number: signal.signal(number, lambda *_: interrupted.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield interrupted
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _prepare(options: DriveOptions, display: Display) -> RunSetup:
@@ -120,20 +170,24 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
     if options.stage is Stage.VEHIL and options.bus in ("auto", "emulated"):
         raise UserMistake("stage vehil drives the car on a bus: name it with --bus, for example --bus socketcan:can0")
     bus = None if options.stage.is_lockstep else choose(options.bus)
-    reference = scenario.reference(vehicle)
+    scenario.reference(vehicle)  # refuses a road that leaves the car no room
     library = build(vehicle.model, OcpOptions(), display.announce) if solver == COMPILED_SOLVER else None
-    setup = RunSetup(
+    if options.stage.is_lockstep and (options.bus != "auto" or options.view_port is not None):
+        raise UserMistake(f"stage {options.stage.value} runs in one process in virtual time: it takes neither --bus nor --view")
+    GatewayCore(catalogue, vehicle, boot_id=0)  # refuses a DBC that lacks something
+    return RunSetup(
         scenario, options.stage, vehicle, catalogue, solver, library, bus, options.seed, options.out,
         options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port,
     )  # fmt: skip
-    try:
-        options.out.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(scenario_path(options.scenario), setup.directory / "scenario.toml")
-        reference.to_csv(setup.reference_csv)
-        setup.configuration.write_text(json.dumps(_configuration(setup), indent=1) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserMistake(f"run directory {options.out}: {error.strerror or error}") from error
-    return setup
+
+
+def _write_inputs(setup: RunSetup, options: DriveOptions) -> None:
+    """Keep what the run was made of beside what comes out of it."""
+    scenario, copy = scenario_path(options.scenario), setup.directory / "scenario.toml"
+    if scenario.resolve() != copy.resolve():
+        shutil.copyfile(scenario, copy)
+    setup.scenario.reference(setup.vehicle).to_csv(setup.reference_csv)
+    setup.configuration.write_text(json.dumps(_configuration(setup), indent=1) + "\n", encoding="utf-8")
 
 
 def _configuration(setup: RunSetup) -> dict[str, object]:

@@ -38,12 +38,15 @@ Progress = Callable[[StateSample | None], None]
 class LockstepRun:
     """One run in virtual time; `drive` does it."""
 
-    def __init__(self, setup: RunSetup, solver: Solver, recording: Recording, progress: Progress) -> None:
+    def __init__(
+        self, setup: RunSetup, solver: Solver, recording: Recording, progress: Progress, is_interrupted: Callable[[], bool]
+    ) -> None:
         pose = setup.scenario.start_pose
         start = StartPose(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps)
         self._setup = setup
         self._recording = recording
         self._progress = progress
+        self._is_interrupted = is_interrupted
         self._emulator = Emulator(setup.vehicle, setup.catalogue, start, setup.seed, START_NS)
         self._gateway = GatewayCore(setup.catalogue, setup.vehicle, _GATEWAY_BOOT_ID)
         self._nmpc = Nmpc(solver, setup.scenario.reference(setup.vehicle), setup.vehicle, _CONTROLLER_BOOT_ID)
@@ -70,6 +73,8 @@ class LockstepRun:
             while ending is None:
                 now_ns += STEP_NS
                 self._step_car(now_ns, log)
+                if self._is_interrupted():
+                    raise KeyboardInterrupt
                 if now_ns % TICK_NS == 0:
                     ending = self._step_gateway(now_ns, log)
         self._progress(None)

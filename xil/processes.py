@@ -72,6 +72,13 @@ class Processes:
             Death(name, child.returncode, self._last_words(name)) for name, child in self._children.items() if child.poll() is not None
         ]
 
+    def end_one(self, name: str) -> None:
+        """Make one child end; it is not reported as a death any more."""
+        child = self._children.pop(name, None)
+        if child is not None:
+            child.kill()
+            child.wait()
+
     def end(self) -> None:
         """Ask every child to end, then make it."""
         for child in reversed(self._children.values()):
@@ -90,7 +97,7 @@ class Processes:
 
     def _last_words(self, name: str) -> str:
         lines = self._log_path(name).read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else "no message"
+        return lines[-1].removeprefix("xilgate: ") if lines else "no message"
 
     def __enter__(self) -> Self:
         return self

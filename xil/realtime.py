@@ -2,6 +2,7 @@
 
 import contextlib
 import signal
+import socket
 import tempfile
 import time
 from collections.abc import Callable
@@ -11,11 +12,11 @@ import msgspec
 
 from dbc.errors import SetupFailure
 from gateway.channel import Channel
-from gateway.messages import OperatorRequest
-from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, decode, new_boot_id
+from gateway.messages import Mode, OperatorRequest
+from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, decode, new_boot_id, port_of
 from vehicle_emulator.bus.channel import is_served
 from xil.buslog import BusListener
-from xil.operator import Advice, Ending, Operator
+from xil.operator import STANDSTILL_MPS, Advice, Ending, Operator
 from xil.processes import Death, Processes
 from xil.recording import Recording
 from xil.scenario import Stage
@@ -28,9 +29,15 @@ LINGER_S = 0.3
 """Time after the end in which the last samples arrive [s]."""
 SILENCE_S = 5.0
 """A run without any state for this long is over, whatever caused it [s]."""
+MOVING_MODES = (Mode.ENGAGED.name, Mode.SAFE_STOP.name)
+"""In these the gateway drives."""
 SILENT = "no state of the car any more"
 INDISPENSABLE = {"bus", "emulator"}
 """Without these there is no car left to watch."""
+ONLOOKERS = {"view"}
+"""Whether these live changes nothing for the car."""
+STOPPING_S = 30.0
+"""Longest time that an interrupted drive of a real car waits for standstill [s]."""
 
 Progress = Callable[[StateSample | None], None]
 
@@ -59,6 +66,7 @@ class RealtimeRun:
             SetupFailure: a process does not come up.
         """
         setup = self._setup
+        self._check_ports()
         topics = [topic for topic, (source, _) in TOPICS.items() if source is not Source.RUNNER]
         with contextlib.ExitStack() as stack:
             sockets = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xilgate-")))
@@ -67,11 +75,39 @@ class RealtimeRun:
             stack.enter_context(Subscriber(self._receive, topics, setup.telemetry_base_port))
             self._bring_up(stack, processes, sockets / "gateway", sockets / "controller")
             channel = stack.enter_context(Channel(None, str(sockets / "gateway")))
-            return self._operate(processes, channel, scene)
+            try:
+                return self._operate(processes, channel, scene)
+            except KeyboardInterrupt:
+                if setup.stage is Stage.VEHIL:
+                    self._stop_real_car(processes)
+                raise
 
     def _receive(self, topic: str, payload: bytes) -> None:
         if (sample := decode(topic, payload)) is not None:
             self._recording.add(sample)
+
+    def _check_ports(self) -> None:
+        """Refuse ports on which somebody else publishes: a stranger's samples must not pass for those of this run."""
+        sources = [Source.GATEWAY, Source.CONTROLLER] + ([Source.EMULATOR] if self._setup.stage is Stage.HIL else [])
+        for source in sources:
+            port = port_of(source, self._setup.telemetry_base_port)
+            with socket.socket() as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind(("127.0.0.1", port))
+                except OSError:
+                    raise SetupFailure(f"telemetry port {port} of the {source} is busy; choose another with --telemetry-port") from None
+
+    def _stop_real_car(self, processes: Processes) -> None:
+        """Let the gateway bring a real car to a stop before its processes end: without a controller it does so by itself."""
+        self._announce("interrupted: the gateway stops the car; interrupt again to abandon it")
+        processes.end_one("controller")
+        deadline = time.monotonic() + STOPPING_S
+        while time.monotonic() < deadline:
+            state = self._recording.latest("state")
+            if not isinstance(state, StateSample) or (state.mode not in MOVING_MODES) or abs(state.vx_mps) < STANDSTILL_MPS:
+                return
+            time.sleep(POLL_S)
 
     def _bring_up(self, stack: contextlib.ExitStack, processes: Processes, gateway_socket: Path, controller_socket: Path) -> None:
         setup, bus = self._setup, self._setup.bus
@@ -154,7 +190,7 @@ class RealtimeRun:
 
     def _note_deaths(self, processes: Processes) -> None:
         for death in processes.deaths():
-            if death.name not in self._deaths:
+            if death.name not in self._deaths and death.name not in ONLOOKERS:
                 self._deaths[death.name] = death
                 self._announce(f"{death.name} ended: {_describe(death)}")
 

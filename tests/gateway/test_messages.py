@@ -1,13 +1,15 @@
 """Wire form of the control path."""
 
 import math
+import socket
 import struct
 import zlib
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.channel import Channel
+from gateway.channel import Channel, ChannelError
 from gateway.messages import (
     HORIZON_STEPS,
     CommandStatus,
@@ -81,3 +83,14 @@ def test_channel_without_a_listener_counts(tmp_path):
     with Channel(None, str(tmp_path / "nobody")) as sender:
         sender.send(OperatorRequest(1, 1, Operation.RESET))
         assert sender.unsent == 1
+
+
+def test_a_socket_in_use_is_refused_and_a_dead_one_taken_over(tmp_path):
+    path = str(tmp_path / "a")
+    with Channel(path, None), pytest.raises(ChannelError, match="in use"):
+        Channel(path, None)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as dead:
+        dead.bind(path)
+    with Channel(path, None) as receiver, Channel(None, path) as sender:
+        sender.send(OperatorRequest(1, 1, Operation.RESET))
+        assert receiver.newest(OperatorRequest) is not None

@@ -1,13 +1,16 @@
 """Mistakes get one line and an exit code, never a traceback."""
 
+import fcntl
 import json
 import os
+import signal
 import socket
 
 import pytest
 
 from dbc.catalogue import ROBOTS_DBC
-from tests.support.processes import free_base_port, xilgate
+from tests.support.processes import free_base_port, start_xilgate, wait_until, xilgate
+from xil.scenario import scenario_path
 
 
 def fails(code, *words, arguments, **options):
@@ -37,13 +40,63 @@ def test_vehil_needs_a_real_bus(tmp_path):
     fails(2, "--bus", arguments=["drive", "--stage", "vehil", "--out", str(tmp_path)])
 
 
-def test_busy_telemetry_port(tmp_path):
+@pytest.mark.parametrize("offset", [0, 1, 2, 3])
+def test_busy_telemetry_port(tmp_path, offset):
     base = free_base_port()
     with socket.socket() as other:
         other.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        other.bind(("127.0.0.1", base))
+        other.bind(("127.0.0.1", base + offset))
         other.listen()
-        fails(3, str(base), "busy", arguments=["drive", "--bus", "emulated", "--telemetry-port", str(base), "--out", str(tmp_path)])
+        arguments = ["drive", "--bus", "emulated", "--telemetry-port", str(base), "--out", str(tmp_path)]
+        fails(3, str(base + offset), "busy", "--telemetry-port", arguments=arguments)
+
+
+@pytest.mark.parametrize("option", [["--bus", "emulated"], ["--view"]])
+def test_lockstep_takes_no_bus_and_no_view(tmp_path, option):
+    fails(2, "sil", option[0], arguments=["drive", "--stage", "sil", *option, "--out", str(tmp_path)])
+
+
+def test_run_directory_in_use_is_left_alone(tmp_path):
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    (tmp_path / "summary.json").write_text("theirs")
+    fails(2, "in use", "--out", arguments=["drive", "--stage", "sil", "--out", str(tmp_path)])
+    os.close(descriptor)
+    assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
+
+
+@pytest.mark.parametrize("stage", ["mil", "sil"])
+def test_interrupted_run_leaves_no_verdict_of_an_earlier_one(tmp_path, stage):
+    (tmp_path / "summary.json").write_text("stale")
+    (tmp_path / "report.html").write_text("stale")
+    process = start_xilgate("drive", "--stage", stage, "--out", str(tmp_path))
+    wait_until((tmp_path / "bus.log").exists, 60, "the drive to begin")
+    process.send_signal(signal.SIGINT)
+    output, _ = process.communicate(timeout=30)
+    assert process.returncode == 130, output
+    assert "Traceback" not in output
+    assert not (tmp_path / "summary.json").exists()
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_names_with_brackets_are_names(tmp_path):
+    text = scenario_path("iso3888-1").read_text().replace('"gate 1"', '"[/gate] 1"')
+    assert "[/gate]" in text
+    (tmp_path / "mine.toml").write_text(text)
+    out = tmp_path / "[run]"
+    finished = xilgate("drive", str(tmp_path / "mine.toml"), "--stage", "sil", "--out", str(out))
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stdout.splitlines() == ["PASS  every limit kept", f"report: {out / 'report.html'}"]
+    assert "[/gate] 1" in (out / "report.html").read_text()
+
+
+def test_late_write_error_is_one_line(tmp_path):
+    (tmp_path / "report.html").mkdir()
+    fails(3, "report.html", arguments=["drive", "--stage", "sil", "--out", str(tmp_path)])
+
+
+def test_operating_without_a_gateway(tmp_path):
+    fails(3, "no gateway", arguments=["operate", "engage", "--gateway-socket", str(tmp_path / "nobody")])
 
 
 def test_busy_page_port():
@@ -86,7 +139,7 @@ def test_missing_compiler(tmp_path):
 
 def test_run_directory_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    fails(2, "file", arguments=["drive", "--stage", "sil", "--out", str(tmp_path / "file" / "run")])
+    fails(3, "file", arguments=["drive", "--stage", "sil", "--out", str(tmp_path / "file" / "run")])
 
 
 def test_doctor_speaks_json():
