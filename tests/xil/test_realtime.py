@@ -10,6 +10,7 @@ from gateway.conditions import MAX_TICK_GAP_NS
 from gateway.telemetry import StateSample, Subscriber, decode
 from tests.support.processes import children, end, free_base_port, is_running, start_xilgate, wait_until
 from tests.support.stall import StallProbe
+from vehicle_emulator.bus.channel import is_served
 
 EVERYONE = {"bus", "gateway", "controller", "emulator"}
 
@@ -119,3 +120,26 @@ def test_no_process_survives_its_runner(drive, number):
     drive.process.communicate(timeout=20)
     assert drive.process.returncode == (-9 if number is signal.SIGKILL else 130)
     wait_until(drive.is_gone, 5, "the end of every process")
+
+
+def test_interrupting_a_real_car_stops_it_first(tmp_path):
+    port, emulator_port = free_base_port(), free_base_port() + 40
+    channel = f"vehil-{os.getpid()}"
+    hub = start_xilgate("bus", channel)
+    wait_until(lambda: is_served(channel), 20, "the bus")
+    emulator = start_xilgate("emulator", "--bus", f"xilgate:{channel}", "--y-m", "-0.3", "--telemetry-port", str(emulator_port))
+    states = []
+    reader = Subscriber(lambda topic, payload: states.append(decode(topic, payload)), ["state"], port)
+    arguments = ["--stage", "vehil", "--bus", f"xilgate:{channel}", "--out", str(tmp_path), "--telemetry-port", str(port)]
+    process = start_xilgate("drive", "lane-keeping", *arguments)
+    try:
+        wait_until(lambda: states and states[-1].mode == "ENGAGED" and states[-1].vx_mps > 5.0, 60, "the car to drive")
+        process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=40)
+        assert process.returncode == 130, output
+        assert states[-1].mode == "SAFE_STOP"
+        assert abs(states[-1].vx_mps) < 0.15
+    finally:
+        reader.close()
+        for each in (process, emulator, hub):
+            end(each)
