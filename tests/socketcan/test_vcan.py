@@ -51,13 +51,16 @@ def test_we_see_what_cansend_sends():
 
 
 def test_three_processes_drive_over_it(tmp_path):
-    # The verdict is printed, not asserted: a guest with one slow processor is no real-time machine. The wiring is.
+    # The verdict is printed, not asserted: a guest with one slow processor, which its host may hold up, is no real-time machine.
+    # What is asserted is the wiring: all three processes, engaged over the kernel's bus, every message on it.
     finished = xilgate("drive", "--stage", "hil", "--out", str(tmp_path), "--telemetry-port", str(free_base_port()))
     print(finished.stderr)
     assert finished.returncode in (0, 1)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert json.loads((tmp_path / "configuration.json").read_text())["bus"] == "socketcan:vcan0"
     engaged_s = next(m["value"] for m in summary["metrics"] if m["name"] == "time engaged")
-    assert engaged_s > 1.0, summary["reason"]
-    lines = (tmp_path / "bus.log").read_text().splitlines()
-    assert {int(line.split()[2].partition("#")[0], 16) for line in lines} == CATALOGUE.by_id.keys()
+    assert engaged_s > 0.0, summary["reason"]
+    frames = [line.split()[2].partition("#") for line in (tmp_path / "bus.log").read_text().splitlines()]
+    assert {int(identifier, 16) for identifier, _, _ in frames} == CATALOGUE.by_id.keys()
+    commands = [CanFrame(SR_COMMAND, bytes.fromhex(data), 0) for identifier, _, data in frames if int(identifier, 16) == SR_COMMAND]
+    assert any(CATALOGUE.decode(CATALOGUE.by_id[SR_COMMAND], command)["Enable"] for command in commands)
