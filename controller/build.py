@@ -86,6 +86,23 @@ class Build:
     was_cached: bool
 
 
+@dataclass(frozen=True)
+class Recipe:
+    """All that one library is made from.
+
+    Args:
+        keyed_sources: files of this package that its code comes from.
+        flags: for the compiler.
+        write_sources: writes the C sources for a car and a problem into a directory; names of those to compile.
+    """
+
+    car: ModelParameters
+    options: OcpOptions
+    keyed_sources: tuple[str, ...]
+    flags: tuple[str, ...]
+    write_sources: Callable[[Path, ModelParameters, OcpOptions], list[str]]
+
+
 def find_compiler() -> Compiler:
     """The C compiler of this machine: $CC, else cc, gcc or clang, else the one in the Python package ziglang.
 
@@ -111,7 +128,12 @@ def cache_directory() -> Path:
 
 
 def build(car: ModelParameters, options: OcpOptions, progress: Callable[[str], None]) -> Build:
-    """The library for one car and one problem, from the cache or new.
+    """The library that CasADi generates for one car and one problem; see `build_from`."""
+    return build_from(Recipe(car, options, _KEYED_SOURCES, FLAGS, _generate), progress)
+
+
+def build_from(recipe: Recipe, progress: Callable[[str], None]) -> Build:
+    """The library of a recipe, from the cache or new.
 
     Args:
         progress: told in one line each what takes time.
@@ -120,7 +142,7 @@ def build(car: ModelParameters, options: OcpOptions, progress: Callable[[str], N
         BuildError: no compiler, no place to write, or the compiler refuses.
     """
     compiler = find_compiler()
-    directory = cache_directory() / _key(car, options, compiler)
+    directory = cache_directory() / _key(recipe, compiler)
     if found := _load(directory):
         return found
     try:
@@ -128,7 +150,7 @@ def build(car: ModelParameters, options: OcpOptions, progress: Callable[[str], N
         # Built beside its final place and renamed, so that nobody ever sees half a library.
         work = Path(tempfile.mkdtemp(dir=directory.parent, prefix="building-"))
         try:
-            _make(work, car, options, compiler, progress)
+            _make(work, recipe, compiler, progress)
             _publish(work, directory)
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -139,14 +161,19 @@ def build(car: ModelParameters, options: OcpOptions, progress: Callable[[str], N
     raise BuildError(f"the library cache {directory} does not keep what is written to it")
 
 
-def _make(work: Path, car: ModelParameters, options: OcpOptions, compiler: Compiler, progress: Callable[[str], None]) -> None:
-    start = time.monotonic()
-    progress("generating C code of the controller")
+def _generate(directory: Path, car: ModelParameters, options: OcpOptions) -> list[str]:
     from controller.codegen import generate  # noqa: PLC0415 - CasADi is loaded only when there is something to build
 
-    generate(work / SOURCE_NAME, car, options)
+    generate(directory / SOURCE_NAME, car, options)
+    return [SOURCE_NAME]
+
+
+def _make(work: Path, recipe: Recipe, compiler: Compiler, progress: Callable[[str], None]) -> None:
+    start = time.monotonic()
+    progress("generating C code of the controller")
+    sources = recipe.write_sources(work, recipe.car, recipe.options)
     progress(f"compiling the controller with {compiler}")
-    command = [*compiler.command, *FLAGS, SOURCE_NAME, "-o", LIBRARY_NAME, "-lm"]
+    command = [*compiler.command, *recipe.flags, *sources, "-o", LIBRARY_NAME, "-lm"]
     finished = subprocess.run(command, cwd=work, capture_output=True, text=True, check=False)
     if finished.returncode != 0:
         lines = [line for line in finished.stderr.splitlines() if "error" in line] or finished.stderr.splitlines() or ["no message"]
@@ -154,11 +181,11 @@ def _make(work: Path, car: ModelParameters, options: OcpOptions, compiler: Compi
     metadata = {
         "sha256": _sha256(work / LIBRARY_NAME),
         "compiler": str(compiler),
-        "flags": FLAGS,
+        "flags": recipe.flags,
         "casadi": importlib.metadata.version("casadi"),
         "seconds": round(time.monotonic() - start, 1),
-        "model": car.model_dump(),
-        "options": options.generated(),
+        "model": recipe.car.model_dump(),
+        "options": recipe.options.generated(),
     }
     (work / METADATA_NAME).write_text(json.dumps(metadata, indent=1) + "\n", encoding="utf-8")
 
@@ -184,12 +211,13 @@ def _load(directory: Path) -> Build | None:
     return None
 
 
-def _key(car: ModelParameters, options: OcpOptions, compiler: Compiler) -> str:
+def _key(recipe: Recipe, compiler: Compiler) -> str:
     sources = Path(__file__).parent
     ingredients = {
-        "sources": {name: _sha256(sources / name) for name in _KEYED_SOURCES},
-        "model": car.model_dump(),
-        "options": options.generated(),
+        "sources": {name: _sha256(sources / name) for name in recipe.keyed_sources},
+        "flags": recipe.flags,
+        "model": recipe.car.model_dump(),
+        "options": recipe.options.generated(),
         "casadi": importlib.metadata.version("casadi"),
         "compiler": (compiler.command, compiler.version),
         "machine": platform.machine(),

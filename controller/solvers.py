@@ -3,9 +3,11 @@
 import time
 from collections.abc import Callable
 
-from controller.build import build
+from controller.build import Build, build
 from controller.compiled import CompiledBackEnd
 from controller.problem import OcpOptions
+from controller.riccati.build import build_riccati
+from controller.riccati.solver import RiccatiSolver
 from controller.solver import Solver, SqpSolver
 from dbc.errors import UserMistake
 from dbc.vehicle import ModelParameters
@@ -30,11 +32,21 @@ def _interpreted(car: ModelParameters, options: OcpOptions, progress: Progress, 
     return SqpSolver("casadi-vm", options, lambda buffers: InterpretedBackEnd(functions, buffers), clock)
 
 
+def _riccati(car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
+    return RiccatiSolver(build_riccati(car, options, progress).library, options, clock)
+
+
 SOLVERS: dict[str, Callable[[ModelParameters, OcpOptions, Progress, Clock], Solver]] = {
     "casadi-vm": _interpreted,
     "casadi-c": _compiled,
+    "riccati": _riccati,
 }
-"""Makers by name: `casadi-vm` runs uncompiled, `casadi-c` is the same generated to C."""
+"""Makers by name: `casadi-vm` runs uncompiled, `casadi-c` is the same generated to C, `riccati` uses the structure of the
+problem and takes its state bounds as soft."""
+
+
+LIBRARIES: dict[str, Callable[[ModelParameters, OcpOptions, Progress], Build]] = {"casadi-c": build, "riccati": build_riccati}
+"""Builders of the solvers that are compiled, by name."""
 
 
 def make_solver(name: str, car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock = time.perf_counter_ns) -> Solver:

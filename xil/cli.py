@@ -47,7 +47,7 @@ BusOption = Annotated[str, typer.Option("--bus", help="auto, emulated, socketcan
 DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
 PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of four loopback ports for telemetry")]
-SolverOption = Annotated[str, typer.Option("--solver", help="casadi-c (compiled) or casadi-vm (uncompiled)")]
+SolverOption = Annotated[str, typer.Option("--solver", help="casadi-c, casadi-vm (uncompiled) or riccati (soft bounds)")]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object instead of a table")]
 DBC_FILES = [ROBOTS_DBC, GNSS_IMU_DBC]
 
@@ -89,7 +89,7 @@ def drive(
         Stage, typer.Option(help="mil, sil: virtual time; hil: processes in real time; vehil: a car on the bus")
     ] = Stage.HIL,
     bus: BusOption = "auto",
-    solver: Annotated[str | None, typer.Option(help="casadi-c or casadi-vm; default: what the stage stands for")] = None,
+    solver: Annotated[str | None, typer.Option(help="casadi-c, casadi-vm or riccati; default: what the stage stands for")] = None,
     seed: Annotated[int, typer.Option(min=0, help="of all noise")] = 1,
     out: Annotated[Path | None, typer.Option(help="run directory; default: runs/SCENARIO-STAGE")] = None,
     view: Annotated[bool, typer.Option("--view", help="serve the virtual world while driving")] = False,

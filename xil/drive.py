@@ -16,9 +16,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.status import Status
 
-from controller.build import build
 from controller.problem import OcpOptions
-from controller.solvers import SOLVERS, make_solver
+from controller.solvers import LIBRARIES, SOLVERS, make_solver
 from dbc.catalogue import load
 from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import load_vehicle
@@ -171,7 +170,7 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
         raise UserMistake("stage vehil drives the car on a bus: name it with --bus, for example --bus socketcan:can0")
     bus = None if options.stage.is_lockstep else choose(options.bus)
     scenario.reference(vehicle)  # refuses a road that leaves the car no room
-    library = build(vehicle.model, OcpOptions(), display.announce) if solver == COMPILED_SOLVER else None
+    library = LIBRARIES[solver](vehicle.model, OcpOptions(), display.announce) if solver in LIBRARIES else None
     if options.stage.is_lockstep and (options.bus != "auto" or options.view_port is not None):
         raise UserMistake(f"stage {options.stage.value} runs in one process in virtual time: it takes neither --bus nor --view")
     GatewayCore(catalogue, vehicle, boot_id=0)  # refuses a DBC that lacks something

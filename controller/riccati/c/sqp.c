@@ -1,0 +1,131 @@
+/* Sequential quadratic programming with exact Hessian and full steps.
+ *
+ * The measured state is x_0 from the start on, so that it never moves. After a short step the gradient of the Lagrangian is computed
+ * by one adjoint sweep, a third of the work of a full sweep with second derivatives. That is enough to see convergence; and where it
+ * shows that the step contracted well, the old Jacobian and Hessian, with their factorization, serve for one more step on the exact
+ * gaps and the exact gradient (level C of Bock, Diehl, Kostina, Schloeder: Constrained optimal feedback control, 2007).
+ *
+ * No line search: with one on an L1 merit function 19 of 1200 hard starts failed in the feasibility study, without it 16. Slow solves
+ * are slow by an indefinite Hessian and not by divergence.
+ *
+ * The work is counted in Riccati factorizations, and no new iteration begins beyond WORK_LIMIT; what one iteration can add to that is
+ * bounded by the caps of the quadratic programme.
+ */
+#include <math.h>
+#include <string.h>
+
+#include "lanes.h"
+#include "solver.h"
+
+#define PRIMAL_TOLERANCE 1e-6
+#define DUAL_TOLERANCE 1e-4
+#define MAX_ITERATIONS 20
+#define MAX_REUSES 3         /* of one Jacobian and Hessian */
+#define SHORT_STEP 1.0       /* largest component, m, m/s, rad */
+#define CONTRACTION 0.03     /* that a step must have reached for its matrices to serve again */
+#define LARGEST_STEP 1e8     /* farther is nowhere; NaN is found by the residuals */
+
+#if LANES == 1
+#define WORK_LIMIT 250.0 /* a factorization is slower there */
+#else
+#define WORK_LIMIT 400.0
+#endif
+
+typedef enum { REACHED, NOT_REACHED, NOT_FINITE } progress;
+
+static progress judge(nmpc_solver *s)
+{
+    nmpc_statistics *statistics = &s->statistics;
+    const bool is_finite = residuals(&s->problem, &s->current, &s->model, &statistics->primal_residual, &statistics->dual_residual);
+    if (!is_finite) return NOT_FINITE;
+    return statistics->primal_residual < PRIMAL_TOLERANCE && statistics->dual_residual < DUAL_TOLERANCE ? REACHED : NOT_REACHED;
+}
+
+static progress full_sweep(nmpc_solver *s)
+{
+    linearize(&s->problem, &s->current, &s->model);
+    s->statistics.work += WORK_DERIVATIVES;
+    return judge(s);
+}
+
+/* Leaves the gradient corrected for the Jacobian that is kept. */
+static progress adjoint_sweep(nmpc_solver *s)
+{
+    linearize_gradient(&s->problem, &s->current, &s->model);
+    s->statistics.work += WORK_ADJOINT;
+    const progress now = judge(s);
+    for (int k = 0; k < N; k++) {
+        double correction[NZ];
+        memcpy(correction, s->model.adjoint[k], sizeof correction);
+        for (int i = 0; i < NX; i++) {
+            for (int j = 0; j < NZ; j++) correction[j] -= s->model.jacobian[k][i][j] * s->current.gap_multiplier[k + 1][i];
+        }
+        for (int j = 0; j < NZ; j++) s->model.gradient[k][j] += correction[j];
+    }
+    return now;
+}
+
+/* Residuals in units of their tolerances. */
+static double error(const nmpc_statistics *statistics)
+{
+    return fmax(statistics->primal_residual / PRIMAL_TOLERANCE, statistics->dual_residual / DUAL_TOLERANCE);
+}
+
+static double step_size(const active_set *qp)
+{
+    double largest = 0.0;
+    for (int k = 0; k <= N; k++) {
+        for (int j = 0; j < NZ; j++) {
+            if (fabs(qp->step[k][j]) > largest) largest = fabs(qp->step[k][j]);
+        }
+    }
+    return largest;
+}
+
+static void take_step(const problem_data *p, const riccati *kkt, const active_set *qp, iterate *current)
+{
+    for (int k = 0; k <= N; k++) {
+        for (int j = 0; j < NZ; j++) current->z[k][j] += qp->step[k][j];
+        if (k == N) continue;
+        const double *lower = &p->lower[k * STAGE_ROWS], *upper = &p->upper[k * STAGE_ROWS];
+        for (int j = 0; j < NU; j++) current->z[k][NX + j] = fmin(fmax(current->z[k][NX + j], lower[j]), upper[j]);
+    }
+    memcpy(current->gap_multiplier, kkt->gap_multiplier, sizeof current->gap_multiplier);
+    memcpy(current->row_multiplier, qp->multiplier, sizeof current->row_multiplier);
+}
+
+static nmpc_status iterate_until_done(nmpc_solver *s)
+{
+    nmpc_statistics *statistics = &s->statistics;
+    progress now = full_sweep(s);
+    int reuses = 0;
+    for (bool is_same_hessian = false;;) {
+        if (now == NOT_FINITE) return NMPC_NUMERICAL;
+        s->last_finite = s->current;
+        if (now == REACHED) return NMPC_CONVERGED;
+        if (statistics->sqp_iterations == MAX_ITERATIONS || statistics->work > WORK_LIMIT) return NMPC_LIMIT;
+        const double error_before = error(statistics);
+        statistics->sqp_iterations++;
+        if (!quadratic_program(s, is_same_hessian)) return NMPC_NUMERICAL;
+        const double size = step_size(&s->qp);
+        if (size > LARGEST_STEP) return NMPC_NUMERICAL;
+        take_step(&s->problem, &s->kkt, &s->qp, &s->current);
+        if (size < SHORT_STEP && s->kkt.exact_share == 1.0) {
+            now = adjoint_sweep(s);
+            is_same_hessian = now != NOT_REACHED || (reuses < MAX_REUSES && error(statistics) < CONTRACTION * error_before);
+            reuses++;
+            if (is_same_hessian) continue;
+        }
+        now = full_sweep(s);
+        is_same_hessian = false;
+        reuses = 0;
+    }
+}
+
+/* Solve s->problem from s->current; the answer is s->last_finite, or the guess when not even that gave finite residuals. */
+void sqp(nmpc_solver *s)
+{
+    memset(&s->statistics, 0, sizeof s->statistics);
+    s->last_finite = s->current;
+    s->statistics.status = iterate_until_done(s);
+}
