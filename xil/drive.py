@@ -168,12 +168,12 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
         raise UserMistake(f"solver {solver!r}: there are {', '.join(SOLVERS)}")
     if options.stage is Stage.VEHIL and options.bus in ("auto", "emulated"):
         raise UserMistake("stage vehil drives the car on a bus: name it with --bus, for example --bus socketcan:can0")
-    bus = None if options.stage.is_lockstep else choose(options.bus)
-    scenario.reference(vehicle)  # refuses a road that leaves the car no room
-    library = LIBRARIES[solver](vehicle.model, OcpOptions(), display.announce) if solver in LIBRARIES else None
     if options.stage.is_lockstep and (options.bus != "auto" or options.view_port is not None):
         raise UserMistake(f"stage {options.stage.value} runs in one process in virtual time: it takes neither --bus nor --view")
+    bus = None if options.stage.is_lockstep else choose(options.bus)
+    scenario.reference(vehicle)  # refuses a road that leaves the car no room
     GatewayCore(catalogue, vehicle, boot_id=0)  # refuses a DBC that lacks something
+    library = LIBRARIES[solver](vehicle.model, OcpOptions(), display.announce) if solver in LIBRARIES else None
     return RunSetup(
         scenario, options.stage, vehicle, catalogue, solver, library, bus, options.seed, options.out,
         options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port,

@@ -103,12 +103,13 @@ def test_a_killed_controller_stops_the_car_and_is_named(drive):
     assert drive.is_gone()
 
 
-def test_a_killed_gateway_stops_the_car_and_is_named(drive):
+@pytest.mark.parametrize("victim", ["gateway", "emulator", "bus"])
+def test_whoever_is_killed_ends_the_run_and_is_named(drive, victim):
     drive.wait_for(in_manoeuvre, "the manoeuvre")
-    os.kill(drive.children["gateway"], signal.SIGKILL)
+    os.kill(drive.children[victim], signal.SIGKILL)
     output, _ = drive.process.communicate(timeout=60)
     assert drive.process.returncode == 1, output
-    assert "gateway died" in drive.summary()["reason"]
+    assert f"{victim} died (killed by SIGKILL)" in drive.summary()["reason"]
     assert drive.is_gone()
 
 
