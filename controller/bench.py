@@ -110,8 +110,8 @@ def _row(solver: str, results: list[list[SolveResult]]) -> dict[str, Any]:
         "quiet_p99_us": round(float(np.percentile(quiet_us, 99)), 1),
         "raw_p99_us": round(float(np.percentile(times_us, 99)), 1),
         "raw_max_us": round(float(times_us.max()), 1),
-        "sqp_iterations_mean": _mean([result.sqp_iterations for result in every]),
-        "qp_iterations_mean": _mean([result.qp_iterations for result in every]),
+        "sqp_iterations_mean": _mean([result.effort.sqp_iterations for result in every]),
+        "qp_iterations_mean": _mean([result.effort.qp_iterations for result in every]),
         "converged": sum(result.status is SolveStatus.CONVERGED for result in every) / len(every),
     }
 

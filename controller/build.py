@@ -215,6 +215,7 @@ def _key(recipe: Recipe, compiler: Compiler) -> str:
     sources = Path(__file__).parent
     ingredients = {
         "sources": {name: _sha256(sources / name) for name in recipe.keyed_sources},
+        "equations": _sha256(_equations(recipe.options)),
         "flags": recipe.flags,
         "model": recipe.car.model_dump(),
         "options": recipe.options.generated(),
@@ -223,6 +224,15 @@ def _key(recipe: Recipe, compiler: Compiler) -> str:
         "machine": platform.machine(),
     }
     return hashlib.sha256(json.dumps(ingredients, sort_keys=True).encode()).hexdigest()[:24]
+
+
+def _equations(options: OcpOptions) -> Path:
+    """File of the model's equations."""
+    module = options.model.equations.partition(":")[0]
+    spec = importlib.util.find_spec(module)
+    if spec is None or spec.origin is None:
+        raise BuildError(f"model {options.model.name}: no module {module}")
+    return Path(spec.origin)
 
 
 def _version_of(command: tuple[str, ...]) -> str:

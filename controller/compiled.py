@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.problem import N_INPUTS, N_STATES, Array
-from controller.solver import NlpBuffers, SolverError
+from controller.problem import Array
+from controller.solver import Effort, NlpBuffers, SolverError
 
 _Real = ctypes.c_double
 _Integer = ctypes.c_longlong  # casadi_int
@@ -62,8 +62,9 @@ class CompiledBackEnd:
         except (OSError, AttributeError) as error:
             raise SolverError(f"{library_path}: not a solver library: {error}") from error
         b = buffers
-        self._state, self._inputs, self._duration = np.zeros(N_STATES), np.zeros(N_INPUTS), np.zeros(1)
-        self._after = np.zeros(N_STATES)
+        layout = b.layout
+        self._state, self._after = np.zeros(layout.n_states), np.zeros(layout.n_states)
+        self._inputs, self._duration = np.zeros(layout.n_inputs), np.zeros(1)
         self._solve = CompiledFunction(
             library, "nmpc", (b.w0, b.p, b.lower_w, b.upper_w, b.lower_g, b.upper_g, b.lam_w0, b.lam_g0),
             (b.w, None, None, b.lam_w, b.lam_g, None),
@@ -73,12 +74,12 @@ class CompiledBackEnd:
         counters.restype = ctypes.POINTER(_Integer)
         self._counters = counters
 
-    def solve(self) -> tuple[int | None, int | None]:
+    def solve(self) -> Effort:
         """Solve the programme; SQP and QP iterations, counted in the generated code."""
         counters = self._counters()
         sqp, qp = counters[0], counters[1]
         self._solve()
-        return counters[0] - sqp, counters[1] - qp
+        return Effort(counters[0] - sqp, counters[1] - qp)
 
     def check(self) -> None:
         """Compute constraints and gradient of the Lagrangian at the answer."""

@@ -6,8 +6,8 @@ import casadi as ca
 import numpy as np
 
 from controller.ocp import OcpFunctions
-from controller.problem import N_STATES, Array
-from controller.solver import NlpBuffers
+from controller.problem import Array
+from controller.solver import Effort, NlpBuffers
 
 
 class InterpretedBackEnd:
@@ -21,10 +21,10 @@ class InterpretedBackEnd:
         self._solve = BoundFunction(functions.nmpc, arguments, {"x": b.w, "lam_x": b.lam_w, "lam_g": b.lam_g})
         self._check = BoundFunction(functions.kkt, {"w": b.w, "p": b.p, "lam_g": b.lam_g}, {"g": b.g, "gradient": b.gradient})
 
-    def solve(self) -> tuple[int | None, int | None]:
+    def solve(self) -> Effort:
         """Solve the programme; CasADi tells the SQP iterations, not those of its QP solver."""
         self._solve()
-        return int(self._solve.stats()["iter_count"]), None
+        return Effort(sqp_iterations=int(self._solve.stats()["iter_count"]))
 
     def check(self) -> None:
         """Compute constraints and gradient of the Lagrangian at the answer."""
@@ -32,7 +32,7 @@ class InterpretedBackEnd:
 
     def advance(self, state: Array, inputs: Array, duration_s: float) -> Array:
         """State of the model after `duration_s` of constant input."""
-        return np.array(self._advance(state, inputs, duration_s), dtype=np.float64).reshape(N_STATES)
+        return np.array(self._advance(state, inputs, duration_s), dtype=np.float64).ravel()
 
 
 class BoundFunction:

@@ -24,7 +24,7 @@ def slip_speed(v_x: Expression) -> Expression:
     return 0.5 * (v_x + floor + ca.sqrt((v_x - floor) ** 2 + _SLIP_SPEED_SMOOTHING_MPS**2))
 
 
-def derivative(x: Expression, u: Expression, car: ModelParameters) -> Expression:
+def single_track(x: Expression, u: Expression, car: ModelParameters) -> Expression:
     """Time derivative of the state.
 
     Args:
@@ -59,3 +59,15 @@ def derivative(x: Expression, u: Expression, car: ModelParameters) -> Expression
         v_x * sin_psi + v_y * cos_psi,
         omega,
     )
+
+
+def single_track_lag(x: Expression, u: Expression, car: ModelParameters) -> Expression:
+    """Time derivative of the state behind actuators that follow their commands as lags of first order.
+
+    Args:
+        x: state, shape (8,): that of `single_track`, road-wheel angle delta_a [rad], drive t_a.
+        u: commanded delta and t_r, shape (2,).
+    """
+    actuators = x[6:]
+    lags_s = ca.vertcat(car.steer_lag_s, car.drive_lag_s)
+    return ca.vertcat(single_track(x[:6], actuators, car), (u - actuators) / lags_s)

@@ -8,7 +8,7 @@ import numpy as np
 from controller.delay import DelayCompensator, actuation_delay_s
 from controller.fallback import Fallback, Plan
 from controller.planner import Planner, PlannerOptions, lateral_offset
-from controller.problem import N_INPUTS, N_STATES, Array, Horizon
+from controller.problem import N_CAR_STATES, Array, Horizon
 from controller.reference import ReferencePath
 from controller.solver import Solver, SolveResult, SolveStatus
 from dbc.vehicle import Vehicle
@@ -94,7 +94,7 @@ class Nmpc:
         self._seq = 0
         self._solved_ns: int | None = None
         self._yaw_rad = 0.0
-        self._nothing_planned = Plan(0, np.zeros((HORIZON_STEPS + 1, N_STATES)), np.zeros((HORIZON_STEPS, N_INPUTS)))
+        self._nothing_planned = Plan(0, np.zeros((HORIZON_STEPS + 1, N_CAR_STATES)), np.zeros((HORIZON_STEPS, ocp.model.n_inputs)))
 
     def step(self, state: VehicleState, now_ns: int) -> NmpcOutput:
         """Answer one measured state with one command; what is commanded is always finite."""

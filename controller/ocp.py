@@ -4,6 +4,8 @@ The dynamics hold for k = 0 to N-1 (the paper's index runs to N, one too far). T
 pinned to the measurement, which no constraint can move.
 """
 
+import importlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
@@ -11,8 +13,7 @@ from typing import Any
 import casadi as ca
 
 from controller.integrator import Expression, rk4_step
-from controller.model import derivative
-from controller.problem import N_INPUTS, N_STATES, Layout, OcpOptions
+from controller.problem import Model, OcpOptions
 from dbc.vehicle import ModelParameters
 
 SOLVER_OPTIONS: dict[str, Any] = {
@@ -46,6 +47,13 @@ class OcpFunctions:
     advance: Any
 
 
+def equations(model: Model) -> Callable[[Expression, Expression, ModelParameters], Expression]:
+    """The function (x, u, car) to dx/dt of a model."""
+    module, _, name = model.equations.partition(":")
+    found: Callable[[Expression, Expression, ModelParameters], Expression] = getattr(importlib.import_module(module), name)
+    return found
+
+
 def stage_function(car: ModelParameters, options: OcpOptions) -> Expression:
     """f_d of the paper: one sample of the model, (x, u) to the next x.
 
@@ -53,9 +61,10 @@ def stage_function(car: ModelParameters, options: OcpOptions) -> Expression:
     once and not sixteen times: the C compiler needs a quarter of the time, and the solver no more.
     """
     called = {"never_inline": True}
-    x_sx, u_sx = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS)
-    model = ca.Function("model", [x_sx, u_sx], [derivative(x_sx, u_sx, car)], ["x", "u"], ["dx"], called)
-    x, u = ca.MX.sym("x", N_STATES), ca.MX.sym("u", N_INPUTS)
+    n_states, n_inputs = options.model.n_states, options.model.n_inputs
+    x_sx, u_sx = ca.SX.sym("x", n_states), ca.SX.sym("u", n_inputs)
+    model = ca.Function("model", [x_sx, u_sx], [equations(options.model)(x_sx, u_sx, car)], ["x", "u"], ["dx"], called)
+    x, u = ca.MX.sym("x", n_states), ca.MX.sym("u", n_inputs)
     x_next = rk4_step(model, x, u, options.sample_time_s / options.integrator_steps)
     step = ca.Function("step", [x, u], [x_next], ["x", "u"], ["x_next"], called)
     x_next = x
@@ -66,7 +75,8 @@ def stage_function(car: ModelParameters, options: OcpOptions) -> Expression:
 
 def advance_function(car: ModelParameters, options: OcpOptions) -> Expression:
     """The same for a duration [s] that is an argument, (x, u, duration_s) to the x after it."""
-    x, u, duration = ca.SX.sym("x", N_STATES), ca.SX.sym("u", N_INPUTS), ca.SX.sym("duration_s")
+    x, u, duration = ca.SX.sym("x", options.model.n_states), ca.SX.sym("u", options.model.n_inputs), ca.SX.sym("duration_s")
+    derivative = equations(options.model)
     x_after = x
     for _ in range(options.integrator_steps):
         x_after = rk4_step(lambda x, u: derivative(x, u, car), x_after, u, duration / options.integrator_steps)
@@ -85,17 +95,17 @@ def build_functions(car: ModelParameters, options: OcpOptions) -> OcpFunctions:
 
 def transcribe(car: ModelParameters, options: OcpOptions) -> dict[str, Any]:
     """The programme: decision variables `x`, parameters `p`, objective `f`, constraints `g`."""
-    N = options.horizon_steps
-    layout = Layout(N)
+    layout, N = options.layout, options.horizon_steps
+    n_states, n_inputs = layout.n_states, layout.n_inputs
     w = ca.MX.sym("w", layout.n_variables)
     p = ca.MX.sym("p", layout.n_parameters)
-    nodes = ca.reshape(w[:-N_STATES], N_STATES + N_INPUTS, N)
-    x = ca.horzcat(nodes[:N_STATES, :], w[-N_STATES:])
-    u = nodes[N_STATES:, :]
+    nodes = ca.reshape(w[:-n_states], n_states + n_inputs, N)
+    x = ca.horzcat(nodes[:n_states, :], w[-n_states:])
+    u = nodes[n_states:, :]
 
     ends = [0, *accumulate(layout.parameter_sizes)]
     x_ref, normals, u_previous, Q, Q_N, R, S = ca.vertsplit(p, ends)
-    x_ref, normals = ca.reshape(x_ref, N_STATES, N + 1), ca.reshape(normals, 2, N)
+    x_ref, normals = ca.reshape(x_ref, n_states, N + 1), ca.reshape(normals, 2, N)
 
     error = x - x_ref
     du = u - ca.horzcat(u_previous, u[:, :-1])
@@ -103,5 +113,5 @@ def transcribe(car: ModelParameters, options: OcpOptions) -> dict[str, Any]:
     terminal_cost = ca.dot(Q_N, error[:, -1] ** 2)
 
     gaps = stage_function(car, options).map(N)(x[:, :-1], u) - x[:, 1:]
-    lateral = ca.sum1(normals * error[3:5, 1:])
+    lateral = ca.sum1(normals * error[options.model.position_index, 1:])
     return {"x": w, "p": p, "f": stage_cost + terminal_cost, "g": ca.vertcat(ca.vec(gaps), ca.vec(lateral))}

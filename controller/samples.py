@@ -22,7 +22,7 @@ def command_sample(output: NmpcOutput, solver_name: str, step_time_ns: int) -> C
         drive_norm=command.drive_norm,
         solve_time_ms=command.solve_time_ns * 1e-6,
         step_time_ms=step_time_ns * 1e-6,
-        sqp_iterations=UNKNOWN_ITERATIONS if result is None or result.sqp_iterations is None else result.sqp_iterations,
+        sqp_iterations=UNKNOWN_ITERATIONS if result is None or result.effort.sqp_iterations is None else result.effort.sqp_iterations,
         primal_residual=result.primal_residual if result and has_residuals else -1.0,
         dual_residual=result.dual_residual if result and has_residuals else -1.0,
         lateral_error_m=solution.lateral_error_m if solution else 0.0,

@@ -14,11 +14,11 @@ from typing import Protocol
 import numpy as np
 
 from controller.problem import (
-    N_STATES,
     Array,
     Horizon,
     Layout,
     OcpOptions,
+    full_reference,
     pack_constraint_bounds,
     pack_parameters,
     pack_variable_bounds,
@@ -43,15 +43,41 @@ class SolveStatus(Enum):
 
 
 @dataclass(frozen=True)
+class SubFunction:
+    """Share of one part of a solver in a solve, measured inside its C code."""
+
+    time_ns: int
+    calls: int
+
+
+@dataclass(frozen=True)
+class Effort:
+    """What a solve took; None where the back end cannot tell.
+
+    Args:
+        work: in Riccati factorizations, the unit in which a bounded solver counts.
+        profile: by part, named as in `PROFILE_PARTS`.
+    """
+
+    sqp_iterations: int | None = None
+    qp_iterations: int | None = None
+    work: float | None = None
+    profile: dict[str, SubFunction] | None = None
+
+
+PROFILE_PARTS = ("qp", "line search", "cost and constraints", "gradient", "hessian", "jacobian", "stage sweep")
+"""Parts of a solver: the rows of the paper's table, and `stage sweep` where a solver computes dynamics, Jacobian and Hessian in one."""
+
+
+@dataclass(frozen=True)
 class SolveResult:
     """Answer of a solver.
 
     Args:
-        states: predicted states, shape (N+1, 6).
-        inputs: planned inputs, shape (N, 2).
+        states: predicted states, shape (N+1, n_states).
+        inputs: planned inputs, shape (N, n_inputs).
         primal_residual: largest violation of a gap, a bound or a corridor row; NaN when the plan is not finite.
         dual_residual: largest entry of the gradient of the Lagrangian, or violation of complementarity.
-        sqp_iterations, qp_iterations: of this solve; None where the back end cannot tell.
         solve_time_ns: time that the numerical solver took [ns], without packing and checking.
     """
 
@@ -60,13 +86,12 @@ class SolveResult:
     inputs: Array
     primal_residual: float
     dual_residual: float
-    sqp_iterations: int | None
-    qp_iterations: int | None
+    effort: Effort
     solve_time_ns: int
 
     @property
     def first_input(self) -> Array:
-        """The input to apply now, shape (2,)."""
+        """The input to apply now, shape (n_inputs,)."""
         first: Array = self.inputs[0]
         return first
 
@@ -81,14 +106,17 @@ class WarmStart:
 
 
 class Solver(Protocol):
-    """Solves the problem from one measured state after the other, each from the shifted answer before."""
+    """Solves the problem from one measured state after the other, each from the shifted answer before.
+
+    Between two solves `options` can be replaced by others of the same model, horizon and sample time.
+    """
 
     name: str
     options: OcpOptions
     warm_start: WarmStart | None
 
     def solve(self, state: Array, previous_input: Array, horizon: Horizon) -> SolveResult:
-        """Plan from `state`, shape (6,), when `previous_input`, shape (2,), is what acts before."""
+        """Plan from `state`, shape (n_states,), when `previous_input`, shape (n_inputs,), is what acts before."""
 
     def advance(self, state: Array, inputs: Array, duration_s: float) -> Array:
         """State of the model after `duration_s` of constant input; up to one sample time."""
@@ -129,8 +157,8 @@ class NlpBuffers:
 class NlpBackEnd(Protocol):
     """Evaluates the functions of `ocp.OcpFunctions` on the shared buffers."""
 
-    def solve(self) -> tuple[int | None, int | None]:
-        """Solve the programme; SQP and QP iterations."""
+    def solve(self) -> Effort:
+        """Solve the programme."""
 
     def check(self) -> None:
         """Compute `g` and `gradient` at `w`, `p`, `lam_g`."""
@@ -156,12 +184,23 @@ class SqpSolver:
         clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         self.name = name
-        self.options = options
+        self._options = options
         self.warm_start: WarmStart | None = None
-        self._layout = Layout(options.horizon_steps)
+        self._layout = options.layout
         self._buffers = NlpBuffers(self._layout)
         self._back_end = make_back_end(self._buffers)
         self._clock = clock
+
+    @property
+    def options(self) -> OcpOptions:
+        """The problem's numbers."""
+        return self._options
+
+    @options.setter
+    def options(self, options: OcpOptions) -> None:
+        if options.generated() != self._options.generated():
+            raise ValueError("model, horizon and sample time are written into the solver's code")
+        self._options = options
 
     def solve(self, state: Array, previous_input: Array, horizon: Horizon) -> SolveResult:
         """Plan from `state`; see `Solver`."""
@@ -169,9 +208,9 @@ class SqpSolver:
         if (refusal := self._refusal()) is not None:
             self.warm_start = None
             self._buffers.w[:] = math.nan
-            return self._result(refusal, (math.nan, math.nan), (None, None), 0)
+            return self._result(refusal, (math.nan, math.nan), Effort(), 0)
         start_ns = self._clock()
-        iterations = self._back_end.solve()
+        effort = self._back_end.solve()
         solve_time_ns = self._clock() - start_ns
         primal, dual = self._residuals()
         if math.isnan(primal):
@@ -181,7 +220,7 @@ class SqpSolver:
         else:
             status = SolveStatus.NOT_CONVERGED
         self.warm_start = None if status is SolveStatus.NOT_FINITE else self._shifted()
-        return self._result(status, (primal, dual), iterations, solve_time_ns)
+        return self._result(status, (primal, dual), effort, solve_time_ns)
 
     def advance(self, state: Array, inputs: Array, duration_s: float) -> Array:
         """State of the model after `duration_s` of constant input; see `Solver`."""
@@ -191,11 +230,9 @@ class SqpSolver:
         """Forget the warm start."""
         self.warm_start = None
 
-    def _result(
-        self, status: SolveStatus, residuals: tuple[float, float], iterations: tuple[int | None, int | None], solve_time_ns: int
-    ) -> SolveResult:
+    def _result(self, status: SolveStatus, residuals: tuple[float, float], effort: Effort, solve_time_ns: int) -> SolveResult:
         w, layout = self._buffers.w, self._layout
-        return SolveResult(status, w[layout.state_index], w[layout.input_index], *residuals, *iterations, solve_time_ns)
+        return SolveResult(status, w[layout.state_index], w[layout.input_index], *residuals, effort, solve_time_ns)
 
     def _refusal(self) -> SolveStatus | None:
         """Why the packed problem is none: numbers that are not finite, or bounds that cross."""
@@ -208,8 +245,11 @@ class SqpSolver:
 
     def _pack(self, state: Array, previous_input: Array, horizon: Horizon) -> None:
         b = self._buffers
-        if horizon.reference.shape != (self._layout.horizon_steps + 1, state.size):
-            raise ValueError(f"reference of shape {horizon.reference.shape} for a horizon of {self._layout.horizon_steps} steps")
+        steps, n_states = self._layout.horizon_steps, self._layout.n_states
+        rows, columns = horizon.reference.shape
+        if rows != steps + 1 or columns > n_states or state.shape != (n_states,):
+            shapes = f"reference of shape {(rows, columns)}, state of shape {state.shape}"
+            raise ValueError(f"{shapes}: this solver plans {steps} steps of {n_states} states")
         pack_parameters(b.p, horizon, previous_input, self.options)
         pack_variable_bounds(b.lower_w, b.upper_w, state, horizon, self.options)
         pack_constraint_bounds(b.lower_g, b.upper_g, horizon, self._layout)
@@ -219,7 +259,7 @@ class SqpSolver:
 
     def _cold(self, horizon: Horizon, previous_input: Array) -> WarmStart:
         w = np.empty(self._layout.n_variables)
-        w[self._layout.state_index] = horizon.reference
+        w[self._layout.state_index] = full_reference(horizon, self._layout.n_states)
         w[self._layout.input_index] = previous_input
         return WarmStart(w, np.zeros(self._layout.n_variables), np.zeros(self._layout.n_constraints))
 
@@ -229,8 +269,9 @@ class SqpSolver:
         stage = int(layout.state_index[1, 0])
         w, lam_w = np.concatenate((b.w[stage:], b.w[-stage:])), np.concatenate((b.lam_w[stage:], b.lam_w[-stage:]))
         w[layout.state_index[-1]] = self.advance(b.w[layout.state_index[-1]], b.w[layout.input_index[-1]], self.options.sample_time_s)
+        n = layout.n_states
         gaps, corridor = b.lam_g[: layout.n_gaps], b.lam_g[layout.n_gaps :]
-        lam_g = np.concatenate((gaps[N_STATES:], gaps[-N_STATES:], corridor[1:], corridor[-1:]))
+        lam_g = np.concatenate((gaps[n:], gaps[-n:], corridor[1:], corridor[-1:]))
         return WarmStart(w, lam_w, lam_g)
 
     def _residuals(self) -> tuple[float, float]:

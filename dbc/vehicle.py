@@ -46,7 +46,7 @@ class Pedals(_Section):
 
 
 class ModelParameters(_Section):
-    """Parameters of the controller's bicycle model: M, I_z, L_f, L_r, K_f, K_r, T_max, R, C_r0, C_r2 of the paper."""
+    """Parameters of the controller's bicycle model: M, I_z, L_f, L_r, K_f, K_r, T_max, R, C_r0, C_r2 of the paper, and lags."""
 
     mass_kg: Positive
     yaw_inertia_kgm2: Positive
@@ -58,6 +58,8 @@ class ModelParameters(_Section):
     wheel_radius_m: Positive
     rolling_resistance_n: NotNegative
     air_drag_nps2pm2: NotNegative
+    steer_lag_s: Positive
+    drive_lag_s: Positive
 
 
 class PlantParameters(_Section):

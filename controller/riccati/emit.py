@@ -11,7 +11,7 @@ from pathlib import Path
 import casadi as ca
 
 from controller.ocp import advance_function
-from controller.problem import N_INPUTS, N_STATES, OcpOptions
+from controller.problem import OcpOptions
 from controller.riccati.stage import stage_functions
 from dbc.errors import SetupFailure
 from dbc.vehicle import ModelParameters
@@ -39,7 +39,7 @@ def write_stage_functions(directory: Path, car: ModelParameters, options: OcpOpt
     adjoint, derivatives = stage_functions(car, options)
     functions = [adjoint, derivatives, advance_function(car, options)]
     patterns = {name: derivatives.sparsity_out(name) for name in ("jacobian", "hessian")}
-    sizes = {"HORIZON_STEPS": options.horizon_steps, "N_STATES": N_STATES, "N_INPUTS": N_INPUTS}
+    sizes = {"HORIZON_STEPS": options.horizon_steps, "N_STATES": options.model.n_states, "N_INPUTS": options.model.n_inputs}
     _write(directory / SIZES_NAME, [f"#define {name} {size}" for name, size in sizes.items()])
     header = ['#include "lanes.h"']
     for name, pattern in patterns.items():

@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.problem import N_INPUTS, N_STATES, Array, Layout, OcpOptions
-from controller.solver import DUAL_TOLERANCE, PRIMAL_TOLERANCE, NlpBuffers, SolverError, SqpSolver
+from controller.problem import Array, OcpOptions
+from controller.solver import DUAL_TOLERANCE, PRIMAL_TOLERANCE, Effort, NlpBuffers, SolverError, SqpSolver
 
 PENALTY_LINEAR = 500.0
 PENALTY_QUADRATIC = 400.0
@@ -66,17 +66,19 @@ class RiccatiBackEnd:
             *map(_address, (b.w0, b.lam_w0, b.lam_g0, b.p, b.lower_w, b.upper_w, b.lower_g, b.upper_g)), PENALTY_LINEAR, PENALTY_QUADRATIC
         )
         self.statistics = _Statistics()
-        self._state, self._inputs, self._after = np.zeros(N_STATES), np.zeros(N_INPUTS), np.zeros(N_STATES)
+        layout = b.layout
+        self._state, self._inputs, self._after = np.zeros(layout.n_states), np.zeros(layout.n_inputs), np.zeros(layout.n_states)
         self._solve.restype = _Statistics
         self._solve_arguments = (memory, ctypes.byref(problem), *map(_address, (b.w, b.lam_w, b.lam_g)))
         self._evaluate_arguments = (memory, *map(_address, (b.p, b.w, b.lam_g, b.g, b.gradient)))
         self._state_address, self._inputs_address, self._after_address = map(_address, (self._state, self._inputs, self._after))
         self._kept = (buffers, problem)  # the memory behind the addresses
 
-    def solve(self) -> tuple[int | None, int | None]:
+    def solve(self) -> Effort:
         """Solve the programme; SQP iterations, and Newton steps of all its quadratic programmes."""
         self.statistics = self._solve(*self._solve_arguments)
-        return self.statistics.sqp_iterations, self.statistics.qp_iterations
+        s = self.statistics
+        return Effort(s.sqp_iterations, s.qp_iterations, s.work)
 
     def check(self) -> None:
         """Compute constraints and gradient of the Lagrangian at the answer."""
@@ -98,7 +100,7 @@ class RiccatiSolver(SqpSolver):
 
     def __init__(self, library: Path, options: OcpOptions, clock: Callable[[], int] = time.perf_counter_ns, name: str = "riccati") -> None:
         super().__init__(name, options, lambda buffers: RiccatiBackEnd(library, buffers), clock)
-        layout = Layout(options.horizon_steps)
+        layout = options.layout
         self._is_hard = np.zeros(layout.n_variables + layout.n_constraints, dtype=np.bool_)
         self._is_hard[layout.state_index[0]] = self._is_hard[layout.input_index] = True
         self._is_hard[layout.n_variables : layout.n_variables + layout.n_gaps] = True

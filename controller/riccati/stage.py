@@ -10,10 +10,11 @@ from dataclasses import dataclass
 import casadi as ca
 
 from controller.integrator import Expression
-from controller.model import derivative
-from controller.problem import N_INPUTS, N_STATES, OcpOptions
+from controller.model import single_track
+from controller.problem import SINGLE_TRACK, OcpOptions
 from dbc.vehicle import ModelParameters
 
+N_STATES, N_INPUTS = SINGLE_TRACK.n_states, SINGLE_TRACK.n_inputs
 _VELOCITIES, _X, _Y, _PSI, _INPUTS = (0, 1, 2), 3, 4, 5, (6, 7)
 _INNER = (*_VELOCITIES, *_INPUTS)  # what the map in the stage frame depends on, by component of (x, u)
 _N_STAGE = N_STATES + N_INPUTS
@@ -113,7 +114,7 @@ def _model_functions(car: ModelParameters) -> tuple[ca.Function, ca.Function, ca
     """The model f(x, u), its Jacobian with respect to (x, u), and the Hessian of w' f."""
     z, w = ca.SX.sym("z", _N_STAGE), ca.SX.sym("w", N_STATES)
     x, u = z[:N_STATES], z[N_STATES:]
-    dx = derivative(x, u, car)
+    dx = single_track(x, u, car)
     linearised = ca.Function("linearised", [x, u], [ca.jacobian(dx, z)])
     curvature = ca.Function("curvature", [x, u, w], [ca.hessian(ca.dot(w, dx), z)[0]])
     return ca.Function("f", [x, u], [dx]), linearised, curvature

@@ -6,6 +6,7 @@ import pytest
 from rich.console import Console
 
 from controller import bench
+from controller.solver import Effort
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +39,7 @@ def test_both_solvers_take_the_same_iterations_and_compiling_pays(result):
 
 def test_quiet_is_the_smallest_of_the_rounds_of_each_problem():
     def solved(microseconds):
-        return bench.SolveResult(bench.SolveStatus.CONVERGED, None, None, 0.0, 0.0, 2, None, microseconds * 1000)
+        return bench.SolveResult(bench.SolveStatus.CONVERGED, None, None, 0.0, 0.0, Effort(2), microseconds * 1000)
 
     row = bench._row("x", [[solved(10), solved(50)], [solved(30), solved(20)]])
     assert (row["quiet_mean_us"], row["raw_max_us"], row["instances"], row["rounds"]) == (15.0, 50.0, 2, 2)

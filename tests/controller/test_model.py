@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from controller.integrator import rk4_step
-from controller.model import derivative, slip_speed
+from controller.model import single_track, slip_speed
 from controller.ocp import advance_function, stage_function
 from controller.problem import OcpOptions
 from dbc.vehicle import load_vehicle
 
 CAR = load_vehicle().model
 _X, _U = ca.SX.sym("x", 6), ca.SX.sym("u", 2)
-_MODEL = ca.Function("f", [_X, _U], [derivative(_X, _U, CAR)])
+_MODEL = ca.Function("f", [_X, _U], [single_track(_X, _U, CAR)])
 _STAGE = stage_function(CAR, OcpOptions())
 _ADVANCE = advance_function(CAR, OcpOptions())
 
@@ -60,7 +60,7 @@ def test_slip_angles_never_divide_by_less_than_the_floor(v_x):
 
 @given(states, inputs)
 def test_derivatives_agree_with_finite_differences(x, u):
-    jacobian = ca.Function("j", [_X, _U], [ca.jacobian(derivative(_X, _U, CAR), ca.vertcat(_X, _U))])
+    jacobian = ca.Function("j", [_X, _U], [ca.jacobian(single_track(_X, _U, CAR), ca.vertcat(_X, _U))])
     h, z = 1e-6, np.concatenate((x, u))
     numeric = np.column_stack([(by_hand(*np.split(z + h * e, [6])) - by_hand(*np.split(z - h * e, [6]))) / (2 * h) for e in np.eye(8)])
     np.testing.assert_allclose(np.array(jacobian(x, u)), numeric, rtol=1e-4, atol=1e-3)

@@ -13,7 +13,7 @@ from controller.bench_loop import Scenario, drive, nominal_scenarios
 from controller.nmpc import Nmpc, NmpcOptions
 from controller.problem import OcpOptions
 from controller.samples import command_sample, plan_sample
-from controller.solver import SolveResult, SolveStatus
+from controller.solver import Effort, SolveResult, SolveStatus
 from gateway.messages import CommandStatus, ControlCommand, Mode, VehicleState, pack, unpack
 from gateway.telemetry import decode, topic_of
 
@@ -44,7 +44,7 @@ class StubSolver:
         self.asked.append((state, previous_input, horizon))
         value = np.nan if self.status is SolveStatus.NOT_FINITE else 0.01 * np.arange(30.0)[:, None] * np.ones(2)
         inputs = np.broadcast_to(value, (30, 2))
-        return SolveResult(self.status, np.tile(state, (31, 1)), inputs, 0.0, 0.0, 1, 1, self.solve_time_ns)
+        return SolveResult(self.status, np.tile(state, (31, 1)), inputs, 0.0, 0.0, Effort(1, 1), self.solve_time_ns)
 
     def advance(self, state, inputs, duration_s):
         return state
@@ -69,7 +69,7 @@ def test_nominal_scenarios_converge_always_and_stay_on_the_path(solver, vehicle,
     outputs, states = drive(Nmpc(solver, scenario.path, vehicle, boot_id=1), vehicle, scenario, seed=2)
     results = [output.solution.result for output in outputs]
     assert all(output.command.status is CommandStatus.OK for output in outputs)
-    assert np.percentile([result.sqp_iterations for result in results], 95) <= 2  # as the paper reports
+    assert np.percentile([result.effort.sqp_iterations for result in results], 95) <= 2  # as the paper reports
     errors = np.abs([output.solution.lateral_error_m for output in outputs])
     assert errors.max() < {"dlc80": 0.25, "lane60": 0.55, "park10": 0.20}[name]  # lane60 starts 0.5 m beside
     assert errors[-25:].max() < 0.15
@@ -215,7 +215,7 @@ def test_samples_carry_the_plan_and_the_corridor(solver, wavy_path, vehicle):
     output = Nmpc(solver, wavy_path, vehicle, 1).step(state_on(wavy_path, seq=9), 0)
     command, plan = command_sample(output, "casadi-c", 2_500_000), plan_sample(output)
     assert (command.status, command.solver, command.state_seq, command.step_time_ms) == ("OK", "casadi-c", 9, 2.5)
-    assert command.sqp_iterations == output.solution.result.sqp_iterations
+    assert command.sqp_iterations == output.solution.result.effort.sqp_iterations
     assert plan.x_m[0] == pytest.approx(output.solution.start[3])
     left = np.hypot(np.subtract(plan.left_x_m, plan.reference_x_m), np.subtract(plan.left_y_m, plan.reference_y_m))
     right = np.hypot(np.subtract(plan.right_x_m, plan.reference_x_m), np.subtract(plan.right_y_m, plan.reference_y_m))

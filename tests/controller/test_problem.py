@@ -7,7 +7,6 @@ import pytest
 from controller.ocp import SOLVER_OPTIONS, build_functions, stage_function, transcribe
 from controller.problem import (
     Horizon,
-    Layout,
     OcpOptions,
     ProblemError,
     pack_constraint_bounds,
@@ -19,7 +18,7 @@ from controller.problem import (
 def test_the_papers_numbers():
     options = OcpOptions()
     assert (options.horizon_steps, options.sample_time_s, options.integrator_steps) == (30, 0.04, 4)
-    assert options.drive_norm == (-1.0, 1.0)
+    assert options.input_bounds[1] == (-1.0, 1.0)
     assert all(terminal > stage for terminal, stage in zip(options.terminal_weights, options.state_weights, strict=True))
     assert (SOLVER_OPTIONS["max_iter"], SOLVER_OPTIONS["qpsol_options"]["max_iter"]) == (50, 100)
     assert (SOLVER_OPTIONS["tol_pr"], SOLVER_OPTIONS["tol_du"]) == (1e-6, 1e-4)
@@ -29,7 +28,7 @@ def test_the_papers_numbers():
 def test_sizes(vehicle):
     nlp = transcribe(vehicle.model, OcpOptions())
     assert (nlp["x"].numel(), nlp["g"].numel()) == (246, 210)
-    layout = Layout(30)
+    layout = OcpOptions().layout
     assert (layout.n_variables, layout.n_constraints, layout.n_parameters) == (246, 210, nlp["p"].numel())
     together = np.concatenate((layout.state_index.ravel(), layout.input_index.ravel()))
     assert sorted(together) == list(range(246))
@@ -37,7 +36,7 @@ def test_sizes(vehicle):
 
 def test_cost_and_constraints_are_those_of_the_paper(vehicle, problem):
     _, previous_input, horizon = problem
-    options, layout = OcpOptions(), Layout(30)
+    options, layout = OcpOptions(), OcpOptions().layout
     rng = np.random.default_rng(3)
     states = horizon.reference + 0.1 * rng.standard_normal((31, 6))
     inputs = 0.1 * rng.standard_normal((30, 2))
@@ -62,7 +61,7 @@ def test_cost_and_constraints_are_those_of_the_paper(vehicle, problem):
 
 def test_the_check_functions_gradient_agrees_with_finite_differences(vehicle, problem):
     _, previous_input, horizon = problem
-    options, layout = OcpOptions(), Layout(30)
+    options, layout = OcpOptions(), OcpOptions().layout
     kkt = build_functions(vehicle.model, options).kkt
     nlp = transcribe(vehicle.model, options)
     terms = ca.Function("nlp", [nlp["x"], nlp["p"]], [nlp["f"], nlp["g"]])
@@ -79,7 +78,7 @@ def test_the_check_functions_gradient_agrees_with_finite_differences(vehicle, pr
 
 def test_bounds(problem):
     state, _, horizon = problem
-    options, layout = OcpOptions(), Layout(30)
+    options, layout = OcpOptions(), OcpOptions().layout
     lower, upper = np.full(246, np.nan), np.full(246, np.nan)
     pack_variable_bounds(lower, upper, state, horizon, options)
     assert not np.isnan(lower).any()
@@ -87,7 +86,9 @@ def test_bounds(problem):
     first, middle, last = layout.state_index[[0, 7, 30]]
     np.testing.assert_array_equal(lower[first], state)
     np.testing.assert_array_equal(upper[first], state)
-    np.testing.assert_array_equal(upper[middle], (45.0, 4.0, 1.5, np.inf, np.inf, np.inf))
+    grip = 8.5 / horizon.reference[7, 0]
+    np.testing.assert_allclose(upper[middle], (45.0, 4.0, grip, np.inf, np.inf, np.inf))
+    np.testing.assert_allclose(lower[middle], (-1.0, -4.0, -grip, -np.inf, -np.inf, -np.inf))
     np.testing.assert_allclose(upper[last] - horizon.reference[-1], options.terminal_box)
     np.testing.assert_allclose(horizon.reference[-1] - lower[last], options.terminal_box)
     np.testing.assert_array_equal(lower[layout.input_index[29]], (-0.55, -1.0))
@@ -106,10 +107,12 @@ def test_bounds(problem):
     [
         ({"horizon_steps": 1}, "horizon_steps"),
         ({"sample_time_s": 0.0}, "sample_time_s"),
-        ({"state_weights": (1.0, 2.0)}, "state_weights"),
+        ({"state_weights": (1.0,) * 7}, "state_weights"),
         ({"terminal_box": (1.0,) * 5 + (float("nan"),)}, "terminal_box"),
         ({"input_weights": (-1.0, 1.0)}, "input_weights"),
-        ({"steer_rad": (0.5, -0.5)}, "steer_rad"),
+        ({"input_bounds": ((0.5, -0.5), (-1.0, 1.0))}, "input_bounds"),
+        ({"state_bounds": ((-1.0, 45.0),)}, "state_bounds"),
+        ({"lateral_acceleration_mps2": 0.0}, "lateral_acceleration_mps2"),
     ],
 )
 def test_numbers_that_make_no_problem_are_named(changes, named):

@@ -10,7 +10,7 @@ import pytest
 from controller.compiled import CompiledBackEnd
 from controller.planner import Planner, PlannerOptions
 from controller.problem import Horizon, OcpOptions
-from controller.solver import NlpBuffers, SolverError, SolveStatus, SqpSolver
+from controller.solver import Effort, NlpBuffers, SolverError, SolveStatus, SqpSolver
 from controller.solvers import make_solver
 from dbc.errors import UserMistake
 
@@ -30,7 +30,7 @@ def test_an_ordinary_problem_converges(any_solver, problem):
     assert result.states.shape == (31, 6)
     assert result.inputs.shape == (30, 2)
     np.testing.assert_array_equal(result.first_input, result.inputs[0])
-    assert 1 <= result.sqp_iterations <= 10
+    assert 1 <= result.effort.sqp_iterations <= 10
     assert result.solve_time_ns > 0
     for k in range(30):  # the plan obeys the model, step by step
         np.testing.assert_allclose(any_solver.advance(result.states[k], result.inputs[k], 0.04), result.states[k + 1], atol=2e-6)
@@ -42,19 +42,19 @@ def test_the_compiled_solver_is_the_same_algorithm(solver, interpreted, problem)
         compiled, uncompiled = (s.solve(state, previous_input, horizon) for s in (solver, interpreted))
         np.testing.assert_allclose(compiled.states, uncompiled.states, rtol=0, atol=1e-8)
         np.testing.assert_allclose(compiled.inputs, uncompiled.inputs, rtol=0, atol=1e-8)
-        assert compiled.sqp_iterations == uncompiled.sqp_iterations
+        assert compiled.effort.sqp_iterations == uncompiled.effort.sqp_iterations
         previous_input, state = compiled.first_input, compiled.states[1]
 
 
 def test_the_compiled_solver_tells_its_iterations(solver, problem):
     cold = solver.solve(*problem)
-    assert cold.qp_iterations >= cold.sqp_iterations >= 1
+    assert cold.effort.qp_iterations >= cold.effort.sqp_iterations >= 1
     again = solver.solve(*problem)
-    assert again.qp_iterations < 100  # of this solve, not summed up
+    assert again.effort.qp_iterations < 100  # of this solve, not summed up
 
 
 def test_the_uncompiled_solver_does_not_invent_qp_iterations(interpreted, problem):
-    assert interpreted.solve(*problem).qp_iterations is None
+    assert interpreted.solve(*problem).effort.qp_iterations is None
 
 
 def test_active_bounds_and_corridor(any_solver, problem):
@@ -82,7 +82,7 @@ def test_a_corridor_that_crosses_itself_is_no_problem_to_solve(any_solver, probl
     state, previous_input, horizon = problem
     result = any_solver.solve(state, previous_input, replace(horizon, left_m=np.full(31, -1.0), right_m=np.full(31, 0.5)))
     assert result.status is SolveStatus.NOT_CONVERGED
-    assert result.sqp_iterations is None
+    assert result.effort.sqp_iterations is None
 
 
 @pytest.mark.parametrize("where", ["state", "input", "reference", "corridor"])
@@ -139,7 +139,7 @@ class LyingBackEnd:
         self.buffers = buffers
 
     def solve(self):
-        return 1, 1
+        return Effort(1, 1)
 
     def check(self):
         self.buffers.g[:] = 0.0

@@ -13,7 +13,7 @@ import pytest
 from controller.compiled import CompiledBackEnd
 from controller.ocp import transcribe
 from controller.planner import Planner, PlannerOptions
-from controller.problem import Horizon, Layout, OcpOptions
+from controller.problem import Horizon, OcpOptions
 from controller.riccati.build import C_SOURCES, FLAGS, build_riccati, host_flags
 from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC, RiccatiBackEnd, RiccatiSolver, row_residuals
 from controller.solver import NlpBuffers, SolverError, SolveStatus, SqpSolver
@@ -35,7 +35,7 @@ def is_optimal(solver, kkt):
 
     Written anew: a soft row's value is where its penalty moves value + multiplier to (its proximal map).
     """
-    b, layout = solver._buffers, Layout(30)
+    b, layout = solver._buffers, OcpOptions().layout
     g, gradient = (np.array(value).ravel() for value in kkt(b.w, b.p, b.lam_g))
     values, multipliers = np.concatenate((b.w, g[180:])), np.concatenate((b.lam_w, b.lam_g[180:]))
     lower, upper = np.concatenate((b.lower_w, b.lower_g[180:])), np.concatenate((b.upper_w, b.upper_g[180:]))
@@ -56,7 +56,7 @@ def test_the_first_input_is_that_of_the_papers_solver(riccati, library, recorded
         assert ours.status is theirs.status is SolveStatus.CONVERGED
         np.testing.assert_allclose(ours.first_input, theirs.first_input, rtol=0, atol=1e-5)
         np.testing.assert_allclose(ours.states, theirs.states, rtol=0, atol=1e-4)
-        assert ours.sqp_iterations <= theirs.sqp_iterations + 2
+        assert ours.effort.sqp_iterations <= theirs.effort.sqp_iterations + 2
 
 
 def test_from_its_own_warm_start_it_converges_in_few_iterations(riccati, problem, vehicle, wavy_path):
@@ -68,7 +68,7 @@ def test_from_its_own_warm_start_it_converges_in_few_iterations(riccati, problem
         assert result.status is SolveStatus.CONVERGED
         for k in range(30):
             np.testing.assert_allclose(riccati.advance(result.states[k], result.inputs[k], 0.04), result.states[k + 1], atol=2e-6)
-        iterations.append(result.sqp_iterations)
+        iterations.append(result.effort.sqp_iterations)
         state, previous_input = result.states[1], result.first_input
         horizon = planner.horizon(state, 0.04 * (step + 1))
     assert max(iterations[1:]) <= 3
@@ -120,7 +120,7 @@ def test_bounds_without_room(riccati, problem, kkt):
 def test_an_input_that_is_given_is_obeyed(riccati_library, riccati, problem):
     riccati.solve(*problem)
     prepared = riccati._buffers
-    buffers = NlpBuffers(Layout(30))
+    buffers = NlpBuffers(OcpOptions().layout)
     for name in ("w0", "p", "lower_w", "upper_w", "lower_g", "upper_g", "lam_w0", "lam_g0"):
         getattr(buffers, name)[:] = getattr(prepared, name)
     for k in (0, 3, 29):
