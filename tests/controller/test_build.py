@@ -62,7 +62,7 @@ def test_a_second_build_comes_from_the_cache(fake, vehicle):
         ({}, {"integrator_steps": 3}, True),
         ({}, {"horizon_steps": 20}, True),
         ({}, {"input_weights": (2.0, 0.2)}, False),  # weights and bounds are given at every solve
-        ({}, {"vx_mps": (0.0, 30.0)}, False),
+        ({}, {"input_bounds": ((-0.3, 0.3), (-1.0, 1.0))}, False),
     ],
 )
 def test_a_changed_number_that_is_in_the_code_means_a_new_library(fake, vehicle, car, options, is_new):
