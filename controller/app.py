@@ -1,17 +1,22 @@
 """The controller process: the NMPC between the gateway's states and its own commands, 25 times a second. Start reading here."""
 
 import logging
+import sys
 import threading
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from controller.nmpc import Nmpc, NmpcOptions
+from controller.inbox import ObjectInbox
+from controller.nmpc import DRIVE_MODEL, Nmpc, NmpcOptions
+from controller.objects import nearest
+from controller.parameters import ParameterStore
 from controller.problem import OcpOptions
 from controller.reference import ReferencePath
-from controller.samples import command_sample, plan_sample
+from controller.samples import Circumstances, ProfileMeter, command_sample, parameters_sample, plan_sample
 from controller.solver import Solver
 from controller.solvers import DEFAULT_SOLVER, make_solver
+from controller.tuning import SERVICE, TuningService
 from dbc.realtime import CONTROLLER_PRIORITY, become_realtime
 from dbc.vehicle import Vehicle, load_vehicle
 from gateway.channel import Channel
@@ -22,6 +27,8 @@ from gateway.telemetry import DEFAULT_BASE_PORT, Publisher, Source, new_boot_id
 log = logging.getLogger("xilgate.controller")
 
 _WARM_UP_SOLVES = 10
+_SWITCH_INTERVAL_S = 0.5e-3
+"""Longest time that Python code on another thread of this process keeps the control thread waiting; Python's own choice is 5 ms."""
 
 
 @dataclass(frozen=True)
@@ -51,30 +58,65 @@ def run(options: ControllerOptions, stop: threading.Event) -> None:
     """
     path = ReferencePath.from_csv(options.reference_csv)
     vehicle = load_vehicle(options.vehicle_path)
-    solver = make_solver(options.solver, vehicle.model, OcpOptions(), log.info)
+    ocp, numbers = OcpOptions(model=DRIVE_MODEL), NmpcOptions(deadline_ns=PLAN_PERIOD_NS)
+    solver = make_solver(options.solver, vehicle.model, ocp, log.info)
     warm_up(solver, path, vehicle)
-    nmpc = Nmpc(solver, path, vehicle, new_boot_id(), NmpcOptions(deadline_ns=PLAN_PERIOD_NS))
-    state: VehicleState | None = None
-    status = CommandStatus.OK
+    store = ParameterStore(ocp, numbers.planner)
     with (
         Publisher(Source.CONTROLLER, options.telemetry_base_port) as telemetry,
+        ObjectInbox(options.telemetry_base_port) as inbox,
         Channel(options.controller_socket, options.gateway_socket) as channel,
     ):
+        telemetry.serve(SERVICE, TuningService(store).answer)
+        cycle = ControlCycle(Nmpc(solver, path, vehicle, new_boot_id(), numbers), solver.name, channel, telemetry, store=store, inbox=inbox)
+        sys.setswitchinterval(_SWITCH_INTERVAL_S)
         become_realtime(CONTROLLER_PRIORITY)
         loop = PeriodicLoop(PLAN_PERIOD_NS)
         while not stop.is_set():
-            now_ns = loop.wait()
-            state = channel.newest(VehicleState) or state
-            if state is None:
-                continue
-            output = nmpc.step(state, now_ns)
-            channel.send(output.command)
-            if output.command.status is not status:
-                log.info("command status %s -> %s", status.name, output.command.status.name)
-                status = output.command.status
-            telemetry.post(command_sample(output, solver.name, time.monotonic_ns() - now_ns))
-            if (plan := plan_sample(output)) is not None:
-                telemetry.post(plan)
+            cycle.step(loop.wait())
+
+
+class ControlCycle:
+    """What happens 25 times a second. Whatever comes from other threads is taken at the edge, as one reference each."""
+
+    def __init__(
+        self, nmpc: Nmpc, solver_name: str, channel: Channel, telemetry: Publisher, *, store: ParameterStore, inbox: ObjectInbox
+    ) -> None:
+        self._nmpc = nmpc
+        self._solver_name = solver_name
+        self._store = store
+        self._inbox = inbox
+        self._channel = channel
+        self._telemetry = telemetry
+        self._profile = ProfileMeter(solver_name)
+        self._state: VehicleState | None = None
+        self._status = CommandStatus.OK
+
+    def step(self, now_ns: int) -> None:
+        """Answer the newest state with a command, if there has been any."""
+        self._tune(now_ns)
+        self._state = state = self._channel.newest(VehicleState) or self._state
+        if state is None:
+            return
+        objects = nearest(self._inbox.report, now_ns, state.x_m, state.y_m)
+        output = self._nmpc.step(state, now_ns, objects)
+        self._channel.send(output.command)
+        made_with = Circumstances(self._store.in_force, len(objects), self._inbox.rejected)
+        self._telemetry.post(command_sample(output, self._solver_name, time.monotonic_ns() - now_ns, made_with))
+        for sample in (plan_sample(output), self._profile.add(output, now_ns)):
+            if sample is not None:
+                self._telemetry.post(sample)
+        if output.command.status is not self._status:
+            log.info("command status %s -> %s", self._status.name, output.command.status.name)
+            self._status = output.command.status
+
+    def _tune(self, now_ns: int) -> None:
+        """Drive with the newest parameters from this cycle on."""
+        if (taken := self._store.take()) is not None:
+            parameters, entries = taken
+            self._nmpc.tune(parameters.ocp, parameters.planner)
+            for entry in entries:
+                self._telemetry.post(parameters_sample(entry, now_ns))
 
 
 def warm_up(solver: Solver, path: ReferencePath, vehicle: Vehicle) -> None:

@@ -1,167 +1,183 @@
 """`xilgate bench solver`: every solver on the same recorded problems, side by side in one process on one core."""
 
-import os
-import platform
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from rich.table import Table
+from controller import bench_sets, bench_targets
+from controller.bench_agreement import compare
+from controller.bench_check import OptimalityCheck
+from controller.bench_hard import run_hard
+from controller.bench_instructions import count_instructions, find_valgrind
+from controller.bench_library import describe_library, describe_machine
+from controller.bench_limit import limit_of
+from controller.bench_measure import SOFT_SOLVERS, UNIT_SOLVER, Measurement, interleaved
+from controller.bench_sets import Instance
+from controller.build import Build
+from controller.problem import OcpOptions
+from controller.solver import Solver
+from controller.solvers import LIBRARIES, SOLVERS, make_solver
+from dbc.errors import UserMistake
+from dbc.vehicle import FOCUS, Vehicle, load_vehicle
 
-from controller.bench_loop import drive, nominal_scenarios
-from controller.nmpc import Nmpc
-from controller.problem import Array, Horizon, OcpOptions
-from controller.solver import Solver, SolveResult, SolveStatus, WarmStart
-from controller.solvers import DEFAULT_SOLVER, SOLVERS, make_solver
-from dbc.vehicle import FOCUS, load_vehicle
+Progress = Callable[[str], None]
 
-_SEED = 1
+SETS = ("nominal", "active", "hard")
+NOT_TIMED = ("ipopt",)
+"""Solvers for comparing answers, not times."""
+RICCATI_SOLVERS = ("riccati", "riccati-scalar")
+"""Those with an answer from everywhere, and with parts that can be measured alone.
+
+Hard constraints can make a hard start infeasible, and the paper's solver takes seconds on it.
+"""
+CALLGRIND_INSTANCES = 20
 
 
 @dataclass(frozen=True)
-class Instance:
-    """One recorded problem: what a solver was asked, and from where it began."""
-
-    state: Array
-    previous_input: Array
-    horizon: Horizon
-    warm_start: WarmStart | None
-
-
-class RecordingSolver:
-    """A solver that keeps what it is asked."""
-
-    def __init__(self, solver: Solver) -> None:
-        self._solver = solver
-        self.name, self.options = solver.name, solver.options
-        self.advance, self.reset = solver.advance, solver.reset
-        self.instances: list[Instance] = []
-
-    @property
-    def warm_start(self) -> WarmStart | None:
-        """Of the solver inside."""
-        return self._solver.warm_start
-
-    @warm_start.setter
-    def warm_start(self, value: WarmStart | None) -> None:
-        self._solver.warm_start = value
-
-    def solve(self, state: Array, previous_input: Array, horizon: Horizon) -> SolveResult:
-        """Keep the problem, and solve it."""
-        self.instances.append(Instance(state.copy(), previous_input.copy(), horizon, self.warm_start))
-        return self._solver.solve(state, previous_input, horizon)
-
-
-def bench_solver(instances: int, rounds: int, progress: Callable[[str], None], vehicle_path: Path = FOCUS) -> dict[str, Any]:
-    """Measure all solvers on the nominal set.
+class BenchOptions:
+    """What to measure.
 
     Args:
-        instances: problems to take, spread evenly over the scenarios.
+        sets: of `SETS`; the unit is measured on the nominal set in any case.
+        instances: problems of the nominal set, and of the active one; at least 8, so that each scenario is there with a warm start.
         rounds: times that each solver solves each problem. The quiet time of a problem is the smallest of its rounds: what the
             solver needs when the machine leaves it alone.
+        starts: of the hard set.
+        solvers: names; none for all that are timed.
+        agreement: compare the answers with those of other solvers, on `agreement_instances` problems of all sets.
+        callgrind: count instructions.
+    """
+
+    sets: tuple[str, ...] = SETS
+    instances: int = 300
+    rounds: int = 5
+    starts: int = 10_000
+    solvers: tuple[str, ...] = ()
+    agreement: bool = False
+    agreement_instances: int = 150
+    callgrind: bool = False
+
+    def __post_init__(self) -> None:
+        for name in self.sets:
+            if name not in SETS:
+                raise UserMistake(f"set {name!r}: there are {', '.join(SETS)} and all")
+        for name in self.solvers:
+            if name not in SOLVERS:
+                raise UserMistake(f"solver {name!r}: there are {', '.join(SOLVERS)}")
+
+    @property
+    def timed(self) -> list[str]:
+        """Names of the solvers to time, in the order of their turns."""
+        return [name for name in SOLVERS if name in (self.solvers or SOLVERS) and name not in NOT_TIMED]
+
+
+def bench_solver(options: BenchOptions, progress: Progress, vehicle_path: Path = FOCUS) -> dict[str, Any]:
+    """Measure solvers.
+
+    Args:
         progress: told in one line each what takes time.
 
     Returns:
-        `{"machine": ..., "rows": [...]}`, one row for each solver.
+        `machine`, `unit`, `solvers` (libraries), `rows` (nominal and active set), `profile`, `limit`, `hard`,
+        `agreement`, `instructions` and `targets`; a part that was not asked for is an empty list.
 
     Raises:
-        SetupFailure: no compiler.
+        SetupFailure: no compiler, or no valgrind to count with.
     """
+    if options.callgrind:
+        find_valgrind()
     vehicle = load_vehicle(vehicle_path)
-    solvers = [make_solver(name, vehicle.model, OcpOptions(), progress) for name in SOLVERS]
-    recorder = RecordingSolver(next(solver for solver in solvers if solver.name == DEFAULT_SOLVER))
-    for scenario in nominal_scenarios():
-        progress(f"recording problems: {scenario.name}")
-        recorder.reset()
-        drive(Nmpc(recorder, scenario.path, vehicle, boot_id=1), vehicle, scenario, _SEED)
-    recorded = recorder.instances
-    chosen = [recorded[round(i)] for i in np.linspace(0, len(recorded) - 1, min(instances, len(recorded)))]
-    progress(f"solving {len(chosen)} problems {rounds} times with {', '.join(SOLVERS)}")
-    with _on_one_core():
-        results = _interleaved(solvers, chosen, rounds)
-    return {"machine": _machine(), "rows": [_row(solver.name, results[solver.name]) for solver in solvers]}
-
-
-def _interleaved(solvers: list[Solver], instances: list[Instance], rounds: int) -> dict[str, list[list[SolveResult]]]:
-    """Results by solver, round and instance; the solvers take turns at each instance, so that noise meets them alike."""
-    results: dict[str, list[list[SolveResult]]] = {solver.name: [] for solver in solvers}
-    for _ in range(rounds):
-        for rows in results.values():
-            rows.append([])
-        for instance in instances:
-            for solver in solvers:
-                solver.warm_start = instance.warm_start
-                results[solver.name][-1].append(solver.solve(instance.state, instance.previous_input, instance.horizon))
-    return results
-
-
-def _row(solver: str, results: list[list[SolveResult]]) -> dict[str, Any]:
-    times_us = np.array([[result.solve_time_ns * 1e-3 for result in row] for row in results])
-    quiet_us, every = times_us.min(axis=0), [result for row in results for result in row]
-    return {
-        "solver": solver,
-        "set": "nominal",
-        "instances": times_us.shape[1],
-        "rounds": times_us.shape[0],
-        "quiet_mean_us": round(float(quiet_us.mean()), 1),
-        "quiet_p99_us": round(float(np.percentile(quiet_us, 99)), 1),
-        "raw_p99_us": round(float(np.percentile(times_us, 99)), 1),
-        "raw_max_us": round(float(times_us.max()), 1),
-        "sqp_iterations_mean": _mean([result.effort.sqp_iterations for result in every]),
-        "qp_iterations_mean": _mean([result.effort.qp_iterations for result in every]),
-        "converged": sum(result.status is SolveStatus.CONVERGED for result in every) / len(every),
+    run = _Run(options, vehicle, progress)
+    measurements = run.nominal() + run.active()
+    nominal_unit = next(m for m in measurements if (m.solver, m.set_name) == (UNIT_SOLVER, "nominal"))
+    unit_us = float(nominal_unit.quiet_us.mean())
+    result = {
+        "machine": describe_machine(),
+        "unit": {"solver": UNIT_SOLVER, "set": "nominal", "quiet_mean_us": round(unit_us, 1)},
+        "solvers": run.libraries(),
+        "rows": [measurement.row(unit_us) for measurement in measurements],
+        "profile": [row for m in measurements if m.set_name == "nominal" for row in m.profile()],
+        "limit": run.limit(measurements),
+        "hard": run.hard(unit_us),
+        "agreement": run.agreement(),
+        "instructions": run.instructions(),
     }
+    return result | {"targets": bench_targets.judged(result)}
 
 
-def _mean(counts: list[int | None]) -> float | None:
-    """Mean, or None where the solver does not tell."""
-    known = [count for count in counts if count is not None]
-    return round(float(np.mean(known)), 3) if len(known) == len(counts) else None
+class _Run:
+    """The solvers and problems of one run; each problem set is recorded once, when it is needed first."""
+
+    def __init__(self, options: BenchOptions, vehicle: Vehicle, progress: Progress) -> None:
+        self._options, self._vehicle, self._progress = options, vehicle, progress
+        self._solvers: dict[str, Solver] = {}
+        self._recorded: dict[str, list[Instance]] = {}
+
+    def nominal(self) -> list[Measurement]:
+        names = self._options.timed if "nominal" in self._options.sets else []
+        return self._timed([name for name in SOLVERS if name in names or name == UNIT_SOLVER], "nominal")
+
+    def active(self) -> list[Measurement]:
+        if "active" not in self._options.sets:
+            return []
+        measurements = self._timed([name for name in self._options.timed if name != "casadi-vm"], "active")
+        return [part for m in measurements for part in ((m, m.feasible()) if m.solver in SOFT_SOLVERS else (m,))]
+
+    def hard(self, unit_us: float) -> list[dict[str, Any]]:
+        names = [name for name in self._options.timed if name in RICCATI_SOLVERS]
+        if "hard" not in self._options.sets or not names:
+            return []
+        starts = bench_sets.hard(self._set("nominal") + self._set("active"), self._options.starts)
+        self._progress(f"solving {len(starts)} hard starts with {', '.join(names)}")
+        check = OptimalityCheck(self._library(UNIT_SOLVER).library, OcpOptions())
+        return run_hard([self._solver(name) for name in names], starts, check, unit_us)
+
+    def limit(self, measurements: list[Measurement]) -> list[dict[str, Any]]:
+        found = {m.solver: m for m in measurements if m.set_name == "nominal" and m.solver in RICCATI_SOLVERS}
+        return [limit_of(self._solver(name), self._library(name), measurement, OcpOptions()) for name, measurement in found.items()]
+
+    def agreement(self) -> list[dict[str, Any]]:
+        if not self._options.agreement:
+            return []
+        third = -(-self._options.agreement_instances // 3)
+        nominal, active = self._set("nominal"), self._set("active")
+        problems = [*_thinned(nominal, third), *_thinned(active, third), *bench_sets.hard(nominal + active, third, seed=2)]
+        others = [name for name in (UNIT_SOLVER, "qrqp", "ipopt") if name in SOLVERS]
+        self._progress(f"comparing riccati with {', '.join(others)} on {len(problems)} problems")
+        return [compare(self._solver("riccati"), self._solver(name), problems) for name in others]
+
+    def instructions(self) -> list[dict[str, Any]]:
+        if not self._options.callgrind:
+            return []
+        car, options = self._vehicle.model, OcpOptions()
+        builds = {name: self._library(name) for name in self._options.timed if name in LIBRARIES}
+        return count_instructions(builds, _thinned(self._set("nominal"), CALLGRIND_INSTANCES), car, options, self._progress)
+
+    def libraries(self) -> list[dict[str, Any]]:
+        names = [name for name in SOLVERS if name in self._solvers and name in LIBRARIES]
+        return [describe_library(name, self._library(name)) for name in names]
+
+    def _timed(self, names: list[str], set_name: str) -> list[Measurement]:
+        solvers, instances = [self._solver(name) for name in names], self._set(set_name)
+        self._progress(f"solving {len(instances)} problems of the {set_name} set {self._options.rounds} times with {', '.join(names)}")
+        return interleaved(solvers, instances, self._options.rounds, set_name)
+
+    def _solver(self, name: str) -> Solver:
+        if name not in self._solvers:
+            self._solvers[name] = make_solver(name, self._vehicle.model, OcpOptions(), self._progress)
+        return self._solvers[name]
+
+    def _library(self, name: str) -> Build:
+        return LIBRARIES[name](self._vehicle.model, OcpOptions(), self._progress)
+
+    def _set(self, name: str) -> list[Instance]:
+        if name not in self._recorded:
+            record = {"nominal": bench_sets.nominal, "active": bench_sets.active}[name]
+            self._recorded[name] = record(self._vehicle, self._options.instances, self._progress)
+        return self._recorded[name]
 
 
-def to_table(result: dict[str, Any]) -> Table:
-    """The result for people."""
-    rows = result["rows"]
-    counts = f"{rows[0]['instances']} problems, quiet: smallest of {rows[0]['rounds']} rounds"
-    table = Table(title="Solve time", caption=f"{counts}\n{result['machine']}")
-    for heading in ("solver", "set"):
-        table.add_column(heading, no_wrap=True)
-    for heading in ("quiet\nmean us", "quiet\np99 us", "raw\np99 us", "raw\nmax us", "SQP\nits", "QP\nits", "con-\nverged", "of\nVM"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    uncompiled = next(row["quiet_mean_us"] for row in rows if row["solver"] == "casadi-vm")
-    for row in rows:
-        times = (f"{row[key]:.0f}" for key in ("quiet_mean_us", "quiet_p99_us", "raw_p99_us", "raw_max_us"))
-        its = ("-" if row[key] is None else f"{row[key]:.2f}" for key in ("sqp_iterations_mean", "qp_iterations_mean"))
-        ratio = f"1/{uncompiled / row['quiet_mean_us']:.1f}"
-        table.add_row(row["solver"], row["set"], *times, *its, f"{row['converged']:.0%}", ratio)
-    return table
-
-
-@contextmanager
-def _on_one_core() -> Iterator[None]:
-    """Hold this process on one of its cores, where the system can do that."""
-    if not hasattr(os, "sched_setaffinity"):
-        yield
-        return
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {max(allowed)})
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, allowed)
-
-
-def _machine() -> str:
-    model = platform.processor() or platform.machine()
-    for line in _lines(Path("/proc/cpuinfo")):
-        if line.startswith("model name"):
-            model = line.partition(":")[2].strip()
-            break
-    return f"{model}, {os.cpu_count()} cores, {platform.system()} {platform.release()}, Python {platform.python_version()}"
-
-
-def _lines(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+def _thinned(instances: Sequence[Instance], count: int) -> list[Instance]:
+    """About `count` of them, evenly spread."""
+    return list(instances[:: max(1, len(instances) // count)])[:count]

@@ -6,14 +6,13 @@ dead time and lag, noise on what is measured.
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 
+from controller.bench_scenarios import Scenario
 from controller.integrator import rk4_step
 from controller.nmpc import Nmpc, NmpcOutput
 from controller.problem import Array
-from controller.reference import ReferencePath
 from dbc.vehicle import Vehicle
 from gateway.messages import PLAN_PERIOD_NS, Mode, VehicleState
 
@@ -22,73 +21,6 @@ _STEP_S = _STEP_NS * 1e-9
 _STATE_AGE_NS = 5_000_000
 _TRANSPORT_NS = 10_000_000
 _DRIVE_LAG_S = 0.2  # accelerator robot and engine
-
-
-@dataclass(frozen=True)
-class Scenario:
-    """A path and where the car stands on it at the beginning.
-
-    Args:
-        offset_m: to the left of the first sample [m].
-        speed_mps: at the beginning [m/s].
-    """
-
-    name: str
-    path: ReferencePath
-    offset_m: float
-    speed_mps: float
-    duration_s: float
-
-    def start(self) -> Array:
-        """State of the model at the beginning, shape (6,)."""
-        path, yaw = self.path, float(self.path.yaw_rad[0])
-        x_m, y_m = path.x_m[0] - self.offset_m * np.sin(yaw), path.y_m[0] + self.offset_m * np.cos(yaw)
-        return np.array((self.speed_mps, 0.0, 0.0, x_m, y_m, yaw))
-
-
-def nominal_scenarios() -> tuple[Scenario, ...]:
-    """The paper's three kinds of driving: double lane change at 80 km/h, lane keeping at 60, parking at 10."""
-    return (
-        Scenario("dlc80", _double_lane_change(80 / 3.6), 0.0, 80 / 3.6, 8.0),
-        Scenario("lane60", _lane_keeping(60 / 3.6), 0.5, 60 / 3.6 - 1.0, 10.0),
-        Scenario("park10", _parking(10 / 3.6), 0.0, 0.0, 18.0),
-    )
-
-
-def _shift(along_m: Array, start_m: float, length_m: float, height_m: float) -> Array:
-    """Lateral shift by a polynomial of fifth degree, without a step in curvature."""
-    t = np.clip((along_m - start_m) / length_m, 0.0, 1.0)
-    return height_m * t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
-
-
-def _path(x_m: Array, y_m: Array, speed_mps: Array, half_width_m: float) -> ReferencePath:
-    yaw_rad = np.unwrap(np.arctan2(np.gradient(y_m), np.gradient(x_m)))
-    return ReferencePath(x_m, y_m, yaw_rad, speed_mps, np.full(x_m.size, half_width_m), np.full(x_m.size, half_width_m))
-
-
-def _double_lane_change(speed_mps: float) -> ReferencePath:
-    # ISO 3888-1: gates at 0 to 15, 45 to 70 and 95 to 125 m, lane offset 3.5 m; the shifts use the room in the gates.
-    x_m = np.arange(-40.0, 200.0, 0.25)
-    y_m = _shift(x_m, 11.25, 40.0, 3.5) - _shift(x_m, 63.25, 40.0, 3.5)
-    return _path(x_m, y_m, np.full(x_m.size, speed_mps), 0.8)
-
-
-def _lane_keeping(speed_mps: float) -> ReferencePath:
-    x_m = np.arange(0.0, 260.0, 0.25)
-    y_m = _shift(x_m, 60.0, 30.0, 3.0) - _shift(x_m, 130.0, 34.0, 3.0) + 4.0 * np.sin(x_m / 120.0) ** 2
-    return _path(x_m, y_m, np.full(x_m.size, speed_mps), 1.0)
-
-
-def _parking(speed_mps: float) -> ReferencePath:
-    # From rest, 1.5 m aside and back, a quarter turn of 10 m radius, to rest.
-    s_m = np.arange(0.0, 42.0, 0.1)
-    curvature = np.convolve(np.where((s_m > 24.0) & (s_m < 24.0 + 5.0 * np.pi), 0.1, 0.0), np.ones(30) / 30, "same")
-    yaw_rad = np.cumsum(curvature) * 0.1
-    lateral_m = _shift(s_m, 4.0, 8.0, 1.5) - _shift(s_m, 14.0, 8.0, 1.5)
-    x_m = np.cumsum(np.cos(yaw_rad)) * 0.1 - np.sin(yaw_rad) * lateral_m
-    y_m = np.cumsum(np.sin(yaw_rad)) * 0.1 + np.cos(yaw_rad) * lateral_m
-    ramp_mps = np.sqrt(2.0 * 0.8 * np.minimum(s_m, s_m[-1] - s_m))
-    return _path(x_m, y_m, np.minimum(speed_mps, ramp_mps), 0.8)
 
 
 class BenchCar:

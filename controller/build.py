@@ -6,6 +6,7 @@ flags. A hit needs neither CasADi nor a compiler run.
 
 import contextlib
 import hashlib
+import importlib
 import importlib.metadata
 import importlib.util
 import json
@@ -17,7 +18,8 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from controller.problem import OcpOptions
@@ -42,10 +44,12 @@ FLAGS = (
 )
 """No -march, no contraction, no -ffast-math: the same numbers on every machine, and NaN stays NaN. Hidden functions can be inlined."""
 _COMPILERS = ("cc", "gcc", "clang")
-_ZIG_FLAGS = ("-mcpu=baseline", "-fno-sanitize=undefined")
-"""Zig compiles for the very machine it runs on, and with checks, unless told otherwise."""
+ZIG = (sys.executable, "-m", "ziglang", "cc")
+_ZIG_FLAGS = ("-mcpu=baseline", "-fno-sanitize=undefined", "-s")
+"""Zig compiles for the very machine it runs on, with checks and debug information, unless told otherwise."""
 
 _KEYED_SOURCES = ("build.py", "codegen.py", "integrator.py", "model.py", "ocp.py", "problem.py")
+_QRQP_SOURCES = ("qrqp.py", "riccati/stage.py")
 
 
 class BuildError(SetupFailure):
@@ -110,15 +114,25 @@ def find_compiler() -> Compiler:
         BuildError: there is none, or $CC does not run.
     """
     if chosen := os.environ.get("CC", "").split():
-        if version := _version_of(tuple(chosen)):
-            return Compiler(tuple(chosen), version)
+        if compiler := compiler_at(tuple(chosen)):
+            return compiler
         raise BuildError(f"the compiler in $CC does not run: {' '.join(chosen)}")
     for name in _COMPILERS:
-        if (path := shutil.which(name)) and (version := _version_of((path,))):
-            return Compiler((path,), version)
-    if importlib.util.find_spec("ziglang") and (version := _version_of((sys.executable, "-m", "ziglang", "cc"))):
-        return Compiler((sys.executable, "-m", "ziglang", "cc", *_ZIG_FLAGS), version)
+        if (path := shutil.which(name)) and (compiler := compiler_at((path,))):
+            return compiler
+    if importlib.util.find_spec("ziglang") and (compiler := compiler_at(ZIG)):
+        return replace(compiler, command=(*ZIG, *_ZIG_FLAGS))
     raise BuildError("no C compiler found: install gcc or clang, or `pip install ziglang`, or set CC")
+
+
+def compiler_at(command: tuple[str, ...]) -> Compiler | None:
+    """The compiler that is called so; None when it does not run."""
+    try:
+        finished = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    except OSError:
+        return None
+    version = finished.stdout.splitlines()[0].strip() if finished.returncode == 0 and finished.stdout else ""
+    return Compiler(command, version) if version else None
 
 
 def cache_directory() -> Path:
@@ -129,19 +143,26 @@ def cache_directory() -> Path:
 
 def build(car: ModelParameters, options: OcpOptions, progress: Callable[[str], None]) -> Build:
     """The library that CasADi generates for one car and one problem; see `build_from`."""
-    return build_from(Recipe(car, options, _KEYED_SOURCES, FLAGS, _generate), progress)
+    return build_from(Recipe(car, options, _KEYED_SOURCES, FLAGS, partial(_generate, "controller.ocp")), progress)
 
 
-def build_from(recipe: Recipe, progress: Callable[[str], None]) -> Build:
+def build_qrqp(car: ModelParameters, options: OcpOptions, progress: Callable[[str], None]) -> Build:
+    """The same with the derivatives of `qrqp`."""
+    sources = (*_KEYED_SOURCES, *_QRQP_SOURCES)
+    return build_from(Recipe(car, options, sources, FLAGS, partial(_generate, "controller.qrqp")), progress)
+
+
+def build_from(recipe: Recipe, progress: Callable[[str], None], compiler: Compiler | None = None) -> Build:
     """The library of a recipe, from the cache or new.
 
     Args:
         progress: told in one line each what takes time.
+        compiler: None for that of this machine.
 
     Raises:
         BuildError: no compiler, no place to write, or the compiler refuses.
     """
-    compiler = find_compiler()
+    compiler = compiler or find_compiler()
     directory = cache_directory() / _key(recipe, compiler)
     if found := _load(directory):
         return found
@@ -161,10 +182,11 @@ def build_from(recipe: Recipe, progress: Callable[[str], None]) -> Build:
     raise BuildError(f"the library cache {directory} does not keep what is written to it")
 
 
-def _generate(directory: Path, car: ModelParameters, options: OcpOptions) -> list[str]:
+def _generate(module: str, directory: Path, car: ModelParameters, options: OcpOptions) -> list[str]:
+    """Write the C source of the functions that `build_functions` of a module makes."""
     from controller.codegen import generate  # noqa: PLC0415 - CasADi is loaded only when there is something to build
 
-    generate(directory / SOURCE_NAME, car, options)
+    generate(directory / SOURCE_NAME, importlib.import_module(module).build_functions, car, options)
     return [SOURCE_NAME]
 
 
@@ -233,14 +255,6 @@ def _equations(options: OcpOptions) -> Path:
     if spec is None or spec.origin is None:
         raise BuildError(f"model {options.model.name}: no module {module}")
     return Path(spec.origin)
-
-
-def _version_of(command: tuple[str, ...]) -> str:
-    try:
-        finished = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
-    except OSError:
-        return ""
-    return finished.stdout.splitlines()[0].strip() if finished.returncode == 0 and finished.stdout else ""
 
 
 def _sha256(path: Path) -> str:

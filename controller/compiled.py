@@ -1,4 +1,4 @@
-"""Back end `casadi-c`: the same functions generated to C, compiled by `build`, and called without any CasADi.
+"""Back end of `casadi-c` and `qrqp`: functions generated to C, compiled by `build`, and called without any CasADi.
 
 All memory is allocated once and every address is kept: a call costs less than a microsecond and allocates nothing.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from controller.problem import Array
-from controller.solver import Effort, NlpBuffers, SolverError
+from controller.solver import Effort, NlpBuffers, SolverError, SubFunction
 
 _Real = ctypes.c_double
 _Integer = ctypes.c_longlong  # casadi_int
@@ -58,7 +58,7 @@ class CompiledBackEnd:
     def __init__(self, library_path: Path, buffers: NlpBuffers) -> None:
         try:
             library = ctypes.CDLL(str(library_path))
-            counters = library["xilgate_iterations"]
+            measurements, parts = library["xilgate_measurements"], library["xilgate_parts"]
         except (OSError, AttributeError) as error:
             raise SolverError(f"{library_path}: not a solver library: {error}") from error
         b = buffers
@@ -71,15 +71,19 @@ class CompiledBackEnd:
         )  # fmt: skip
         self._check = CompiledFunction(library, "kkt", (b.w, b.p, b.lam_g), (b.g, b.gradient))
         self._advance = CompiledFunction(library, "advance", (self._state, self._inputs, self._duration), (self._after,))
-        counters.restype = ctypes.POINTER(_Integer)
-        self._counters = counters
+        parts.restype = ctypes.c_char_p
+        self._parts = parts().decode().split(",")
+        measurements.restype = ctypes.POINTER(_Integer * (2 + 2 * len(self._parts)))
+        self._measurements = measurements
 
     def solve(self) -> Effort:
-        """Solve the programme; SQP and QP iterations, counted in the generated code."""
-        counters = self._counters()
-        sqp, qp = counters[0], counters[1]
+        """Solve the programme; iterations and profile as measured in the generated code."""
+        measured = self._measurements().contents
+        before = list(measured)
         self._solve()
-        return Effort(counters[0] - sqp, counters[1] - qp)
+        sqp, qp, *spent = (now - then for now, then in zip(measured, before, strict=True))
+        profile = {part: SubFunction(spent[2 * i], spent[2 * i + 1]) for i, part in enumerate(self._parts)}
+        return Effort(sqp, qp, profile=profile)
 
     def check(self) -> None:
         """Compute constraints and gradient of the Lagrangian at the answer."""

@@ -1,10 +1,11 @@
-"""What the controller commands when a solve fails: the rest of the last good plan, for a while."""
+"""What the controller commands when a solve fails: the rest of the last good plan, for a while; and from where it solves again."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from controller.problem import Array
+from controller.problem import Array, Layout
+from controller.solver import WarmStart
 from gateway.messages import CommandStatus
 
 MAX_DEGRADED_CYCLES = 3
@@ -17,8 +18,8 @@ class Plan:
 
     Args:
         t_ns: time from which the first input holds [ns].
-        states: shape (N+1, 6).
-        inputs: shape (N, 2).
+        states: shape (N+1, n_states).
+        inputs: shape (N, n_inputs).
     """
 
     t_ns: int
@@ -33,16 +34,20 @@ class Plan:
 
 
 class Fallback:
-    """Decides cycle by cycle which plan to command, and what to say of it.
+    """Decides cycle by cycle which plan to command, and what to say of it; keeps what the next solve begins from.
+
+    A solver that failed begins again from the last good answer, not from where it went astray.
 
     Args:
         period_ns: time between two inputs of a plan [ns].
     """
 
-    def __init__(self, period_ns: int) -> None:
+    def __init__(self, period_ns: int, layout: Layout) -> None:
         self._period_ns = period_ns
+        self._layout = layout
         self._good: Plan | None = None
         self._degraded_cycles = 0
+        self._guess: tuple[int, WarmStart | None] = 0, None
 
     def accept(self, plan: Plan) -> tuple[CommandStatus, Plan]:
         """A good plan: command it."""
@@ -56,3 +61,26 @@ class Fallback:
             return CommandStatus.FAILED, nothing_planned
         status = CommandStatus.DEGRADED if self._degraded_cycles <= MAX_DEGRADED_CYCLES else CommandStatus.FAILED
         return status, self._good.from_time(now_ns, self._period_ns)
+
+    def prime(self, now_ns: int, guess: WarmStart | None) -> None:
+        """Note what a solver that has converged at `now_ns` would begin from one period later."""
+        self._guess = now_ns + self._period_ns, guess
+
+    def guess(self, now_ns: int) -> WarmStart | None:
+        """What to begin from at `now_ns`; None when the last answer is older than a plan may be."""
+        t_ns, guess = self._guess
+        missed = max(0, round((now_ns - t_ns) / self._period_ns))
+        return guess if guess is None or missed == 0 else _shifted(guess, self._layout, missed) if missed <= MAX_DEGRADED_CYCLES else None
+
+
+def _shifted(guess: WarmStart, layout: Layout, samples: int) -> WarmStart:
+    """The guess some samples later; the last stage is repeated."""
+    stage, n_states = layout.n_states + layout.n_inputs, layout.n_states
+    gaps, corridor = guess.lam_g[: layout.n_gaps], guess.lam_g[layout.n_gaps :]
+
+    def later(values: Array, size: int) -> Array:
+        return np.concatenate((values[samples * size :], *[values[-size:]] * samples))
+
+    return WarmStart(
+        later(guess.w, stage), later(guess.lam_w, stage), np.concatenate((later(gaps, n_states), later(corridor, 1)))
+    )

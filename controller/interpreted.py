@@ -7,7 +7,18 @@ import numpy as np
 
 from controller.ocp import OcpFunctions
 from controller.problem import Array
-from controller.solver import Effort, NlpBuffers
+from controller.solver import Effort, NlpBuffers, SubFunction
+
+_STATISTICS = {
+    "qp": "QP",
+    "line search": "linesearch",
+    "cost and constraints": "nlp_fg",
+    "gradient": "nlp_grad",
+    "hessian": "nlp_hess_l",
+    "jacobian": "nlp_jac_fg",
+}
+"""CasADi's name for each part of its SQP method. `jacobian` is one call for the Jacobian of the constraints, the gradient of the
+cost, and both their values; `line search` holds its calls of `cost and constraints`."""
 
 
 class InterpretedBackEnd:
@@ -19,12 +30,19 @@ class InterpretedBackEnd:
         arguments = {"x0": b.w0, "p": b.p, "lbx": b.lower_w, "ubx": b.upper_w, "lbg": b.lower_g, "ubg": b.upper_g,
                      "lam_x0": b.lam_w0, "lam_g0": b.lam_g0}  # fmt: skip
         self._solve = BoundFunction(functions.nmpc, arguments, {"x": b.w, "lam_x": b.lam_w, "lam_g": b.lam_g})
+        self._spent = dict.fromkeys(_STATISTICS, (0.0, 0))  # so far: CasADi's statistics only ever grow
         self._check = BoundFunction(functions.kkt, {"w": b.w, "p": b.p, "lam_g": b.lam_g}, {"g": b.g, "gradient": b.gradient})
 
     def solve(self) -> Effort:
-        """Solve the programme; CasADi tells the SQP iterations, not those of its QP solver."""
+        """Solve the programme; CasADi tells the SQP iterations and the time of each part, not the iterations of its QP solver."""
         self._solve()
-        return Effort(sqp_iterations=int(self._solve.stats()["iter_count"]))
+        stats, before = self._solve.stats(), self._spent
+        self._spent = {part: (stats[f"t_wall_{name}"], stats[f"n_call_{name}"]) for part, name in _STATISTICS.items()}
+        profile = {
+            part: SubFunction(round((time_s - before[part][0]) * 1e9), calls - before[part][1])
+            for part, (time_s, calls) in self._spent.items()
+        }
+        return Effort(sqp_iterations=int(stats["iter_count"]), profile=profile)
 
     def check(self) -> None:
         """Compute constraints and gradient of the Lagrangian at the answer."""

@@ -31,6 +31,9 @@ SOLVER_OPTIONS: dict[str, Any] = {
 }
 """The paper's solver: SQP with QRQP, exact Hessian, at most 50 and 100 iterations, thresholds 1e-6 and 1e-4."""
 
+SQPMETHOD_PARTS = ("qp", "line search", "cost and constraints", "gradient", "hessian", "jacobian")
+"""What the paper's solver spends its time on: the rows of its table."""
+
 
 @dataclass(frozen=True)
 class OcpFunctions:
@@ -40,11 +43,13 @@ class OcpFunctions:
         nmpc: the solver, with the inputs and outputs of `casadi.nlpsol`.
         kkt: (w, p, lam_g) to (g, gradient of f + lam_g' g), both dense.
         advance: (x, u, duration_s) to the state after that time.
+        parts: what a profile of the solver tells apart, names of `solver.PROFILE_PARTS`.
     """
 
     nmpc: Any
     kkt: Any
     advance: Any
+    parts: tuple[str, ...]
 
 
 def equations(model: Model) -> Callable[[Expression, Expression, ModelParameters], Expression]:
@@ -84,13 +89,17 @@ def advance_function(car: ModelParameters, options: OcpOptions) -> Expression:
 
 
 def build_functions(car: ModelParameters, options: OcpOptions) -> OcpFunctions:
-    """Write the programme down and make its functions."""
+    """Write the programme down and make its functions, all derivatives by CasADi."""
     nlp = transcribe(car, options)
+    nmpc = ca.nlpsol("nmpc", "sqpmethod", nlp, SOLVER_OPTIONS)
+    return OcpFunctions(nmpc, kkt_function(nlp), advance_function(car, options), SQPMETHOD_PARTS)
+
+
+def kkt_function(nlp: dict[str, Any]) -> Expression:
+    """(w, p, lam_g) to the constraints and the gradient of f + lam_g' g, both dense."""
     lam_g = ca.MX.sym("lam_g", nlp["g"].numel())
-    lagrangian_gradient = ca.gradient(nlp["f"] + ca.dot(lam_g, nlp["g"]), nlp["x"])
-    kkt_terms = [nlp["g"], ca.densify(lagrangian_gradient)]
-    kkt = ca.Function("kkt", [nlp["x"], nlp["p"], lam_g], kkt_terms, ["w", "p", "lam_g"], ["g", "gradient"])
-    return OcpFunctions(ca.nlpsol("nmpc", "sqpmethod", nlp, SOLVER_OPTIONS), kkt, advance_function(car, options))
+    gradient = ca.densify(ca.gradient(nlp["f"] + ca.dot(lam_g, nlp["g"]), nlp["x"]))
+    return ca.Function("kkt", [nlp["x"], nlp["p"], lam_g], [nlp["g"], gradient], ["w", "p", "lam_g"], ["g", "gradient"])
 
 
 def transcribe(car: ModelParameters, options: OcpOptions) -> dict[str, Any]:

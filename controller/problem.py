@@ -161,7 +161,7 @@ class OcpOptions:
     def generated(self) -> dict[str, Any]:
         """What is written into the generated code; all others are given at every solve."""
         numbers = {name: getattr(self, name) for name in ("horizon_steps", "sample_time_s", "integrator_steps")}
-        return numbers | {"model": asdict(self.model)}
+        return numbers | {"model": _as_data(self.model)}
 
 
 @dataclass(frozen=True)
@@ -237,6 +237,7 @@ class Layout:
 
 
 _layout = cache(Layout)
+_as_data = cache(asdict)  # asked for in every cycle
 
 
 def pack_parameters(out: Array, horizon: Horizon, previous_input: Array, options: OcpOptions) -> None:

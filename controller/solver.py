@@ -115,6 +115,10 @@ class Solver(Protocol):
     options: OcpOptions
     warm_start: WarmStart | None
 
+    @property
+    def answer(self) -> WarmStart:
+        """Decision variables and multipliers of the last answer; valid until the next solve."""
+
     def solve(self, state: Array, previous_input: Array, horizon: Horizon) -> SolveResult:
         """Plan from `state`, shape (n_states,), when `previous_input`, shape (n_inputs,), is what acts before."""
 
@@ -202,6 +206,11 @@ class SqpSolver:
             raise ValueError("model, horizon and sample time are written into the solver's code")
         self._options = options
 
+    @property
+    def answer(self) -> WarmStart:
+        """Decision variables and multipliers of the last answer; see `Solver`."""
+        return WarmStart(self._buffers.w, self._buffers.lam_w, self._buffers.lam_g)
+
     def solve(self, state: Array, previous_input: Array, horizon: Horizon) -> SolveResult:
         """Plan from `state`; see `Solver`."""
         self._pack(state, previous_input, horizon)
@@ -237,7 +246,7 @@ class SqpSolver:
     def _refusal(self) -> SolveStatus | None:
         """Why the packed problem is none: numbers that are not finite, or bounds that cross."""
         b = self._buffers
-        if not np.isfinite(b.p).all() or np.isnan(b.lower_w).any() or np.isnan(b.lower_g).any() or np.isnan(b.upper_g).any():
+        if not (np.isfinite(b.p).all() and np.isfinite(b.w0).all()) or np.isnan(b.lower_g).any() or np.isnan(b.upper_g).any():
             return SolveStatus.NOT_FINITE
         if (b.lower_w > b.upper_w).any() or (b.lower_g > b.upper_g).any():
             return SolveStatus.NOT_CONVERGED

@@ -2,25 +2,33 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 
-from controller.build import Build, build
+from controller.build import Build, build, build_qrqp
 from controller.compiled import CompiledBackEnd
 from controller.problem import OcpOptions
-from controller.riccati.build import build_riccati
+from controller.riccati.build import SCALAR, build_riccati
 from controller.riccati.solver import RiccatiSolver
 from controller.solver import Solver, SqpSolver
 from dbc.errors import UserMistake
 from dbc.vehicle import ModelParameters
 
-DEFAULT_SOLVER = "casadi-c"
+DEFAULT_SOLVER = "riccati"
 
 Progress = Callable[[str], None]
 Clock = Callable[[], int]
 
 
-def _compiled(car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
-    library = build(car, options, progress).library
-    return SqpSolver("casadi-c", options, lambda buffers: CompiledBackEnd(library, buffers), clock)
+def _compiled(name: str, car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
+    library = LIBRARIES[name](car, options, progress).library
+    return SqpSolver(name, options, lambda buffers: CompiledBackEnd(library, buffers), clock)
+
+
+def _ipopt(car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
+    from controller.ipopt import make_ipopt  # noqa: PLC0415 - a compiled solver must run without CasADi
+
+    progress("setting up IPOPT in CasADi")
+    return make_ipopt(car, options, clock)
 
 
 def _interpreted(car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
@@ -32,20 +40,29 @@ def _interpreted(car: ModelParameters, options: OcpOptions, progress: Progress, 
     return SqpSolver("casadi-vm", options, lambda buffers: InterpretedBackEnd(functions, buffers), clock)
 
 
-def _riccati(car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
-    return RiccatiSolver(build_riccati(car, options, progress).library, options, clock)
+def _riccati(name: str, car: ModelParameters, options: OcpOptions, progress: Progress, clock: Clock) -> Solver:
+    return RiccatiSolver(LIBRARIES[name](car, options, progress).library, options, clock, name)
 
 
 SOLVERS: dict[str, Callable[[ModelParameters, OcpOptions, Progress, Clock], Solver]] = {
     "casadi-vm": _interpreted,
-    "casadi-c": _compiled,
-    "riccati": _riccati,
+    "casadi-c": partial(_compiled, "casadi-c"),
+    "qrqp": partial(_compiled, "qrqp"),
+    "riccati": partial(_riccati, "riccati"),
+    "riccati-scalar": partial(_riccati, "riccati-scalar"),
+    "ipopt": _ipopt,
 }
-"""Makers by name: `casadi-vm` runs uncompiled, `casadi-c` is the same generated to C, `riccati` uses the structure of the
-problem and takes its state bounds as soft."""
+"""Makers by name: `casadi-vm` runs uncompiled, `casadi-c` is the same generated to C, `qrqp` is that with derivatives assembled
+from the stages, `riccati` uses the structure of the problem and takes its state bounds as soft, `riccati-scalar` is that for a processor
+without vectors, `ipopt` is the oracle for that."""
 
 
-LIBRARIES: dict[str, Callable[[ModelParameters, OcpOptions, Progress], Build]] = {"casadi-c": build, "riccati": build_riccati}
+LIBRARIES: dict[str, Callable[[ModelParameters, OcpOptions, Progress], Build]] = {
+    "casadi-c": build,
+    "qrqp": build_qrqp,
+    "riccati": build_riccati,
+    "riccati-scalar": partial(build_riccati, target_flags=SCALAR),
+}
 """Builders of the solvers that are compiled, by name."""
 
 

@@ -33,7 +33,8 @@ PURE_MODULES = {
     ),
     "controller": (
         *("problem", "model", "integrator", "ocp", "reference"),
-        *("planner", "delay", "nmpc", "fallback"),
+        *("planner", "planner_options", "localiser", "obstacles", "corridor", "shift", "linking", "passing", "speed"),
+        *("reference_sources", "delay", "disturbance", "estimator", "nmpc", "fallback"),
     ),
     "vehicle_emulator": (
         *("plant", "actuators", "robots", "ins", "emulator"),

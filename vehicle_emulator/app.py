@@ -76,7 +76,6 @@ def world_sample(truth: GroundTruth, t_ns: int, seq: int) -> WorldSample:
         ar_position_norm=truth.ar_position_norm,
         br_position_norm=truth.br_position_norm,
         robots_engaged=truth.are_robots_engaged,
-        objects=[],
     )
 
 

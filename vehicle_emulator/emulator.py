@@ -1,5 +1,6 @@
 """The heart of the emulator: one millisecond of the car, from the gateway's frames to the frames of robots and navigation system."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from random import Random
@@ -16,18 +17,25 @@ from vehicle_emulator.robot_system import RobotPositions, RobotSystem
 STEP_NS = 1_000_000
 """Time that one step advances the car [ns]."""
 _GATEWAY = "GW"
+_DRIVER_BRAKE_NORM = 0.3
+"""Brake pedal that holds a standing car on a slope of 30 %."""
 _DRIVER_GAIN_PER_S = 1.0
 """Acceleration that the safety driver asks for per m/s of speed error."""
 
 
 @dataclass(frozen=True, slots=True)
 class StartPose:
-    """Where the car starts: local frame, x east and y north, yaw counter-clockwise from x, forward speed."""
+    """Where the car starts: local frame, x east and y north, yaw counter-clockwise from x, forward speed, and how the road climbs.
+
+    Args:
+        grade: rise over run, in the direction in which the car points.
+    """
 
     x_m: float = 0.0
     y_m: float = 0.0
     yaw_rad: float = 0.0
     speed_mps: float = 0.0
+    grade: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +61,9 @@ class Emulator:
 
     Deterministic: the same seed, start and frames give the same bytes.
 
-    Until the robots are engaged for the first time, a virtual safety driver holds the start speed with the accelerator and steers
-    straight ahead; afterwards nobody touches pedals or wheel but the robots. The dead-man switch is always pressed.
+    Until the robots are engaged for the first time, a virtual safety driver holds the start speed with the accelerator, or the
+    standing car with the brake, and steers straight ahead; afterwards nobody touches pedals or wheel but the robots. The dead-man
+    switch is always pressed.
 
     Args:
         seed: of the noise of the navigation system.
@@ -70,7 +79,7 @@ class Emulator:
         self._catalogue = catalogue
         self._start = start
         self._robots = RobotSystem(vehicle, catalogue, STEP_NS * 1e-9)
-        plant = FourWheelPlant(vehicle.plant, (start.x_m, start.y_m, start.yaw_rad), start.speed_mps)
+        plant = FourWheelPlant(vehicle.plant, (start.x_m, start.y_m, start.yaw_rad), start.speed_mps, start.grade)
         self._plant: Plant = plant
         self._state = plant.state
         self._ins = NavigationSystem(vehicle.ins, catalogue, Random(seed), period_ns=STEP_NS, start_ns=start_ns, state=self._state)
@@ -90,8 +99,11 @@ class Emulator:
     def _inputs(self, robots: RobotPositions) -> PlantInputs:
         limit_rad = self._vehicle.steering.road_wheel_limit_rad
         road_wheel_rad = min(max(robots.steering_wheel_rad / self._vehicle.steering.ratio, -limit_rad), limit_rad)
-        is_driver_driving = self._start.speed_mps > 0.0 and not self._robots.was_engaged
-        return PlantInputs(road_wheel_rad, self._driver_norm() if is_driver_driving else robots.accelerator_norm, robots.brake_norm)
+        if self._robots.was_engaged:
+            return PlantInputs(road_wheel_rad, robots.accelerator_norm, robots.brake_norm)
+        if self._start.speed_mps > 0.0:
+            return PlantInputs(road_wheel_rad, self._driver_norm(), robots.brake_norm)
+        return PlantInputs(road_wheel_rad, robots.accelerator_norm, max(robots.brake_norm, _DRIVER_BRAKE_NORM))
 
     def _driver_norm(self) -> float:
         """Accelerator of the safety driver: what the resistances need, and a correction of the speed."""
@@ -99,7 +111,8 @@ class Emulator:
         rolling_n = p.rolling_resistance_coefficient * p.mass_kg * GRAVITY_MPS2
         air_n = 0.5 * AIR_DENSITY_KGPM3 * p.drag_area_m2 * vx_mps * vx_mps
         correction_n = p.mass_kg * _DRIVER_GAIN_PER_S * (self._start.speed_mps - vx_mps)
-        wanted_n = rolling_n + air_n + p.drag_torque_force_n + correction_n
+        climb_n = p.mass_kg * GRAVITY_MPS2 * math.sin(math.atan(self._start.grade))
+        wanted_n = rolling_n + air_n + climb_n + p.drag_torque_force_n + correction_n
         return min(max(wanted_n / (p.full_drive_force_n + p.drag_torque_force_n), 0.0), 1.0)
 
     def _values(self, name: str, now_ns: int) -> dict[str, float]:

@@ -126,16 +126,20 @@ class _Wheel:
 
 
 class FourWheelPlant:
-    """A front-driven car on a level road.
+    """A front-driven car on a road that climbs evenly in the direction in which the car points.
 
     Args:
         parameters: numbers of the car.
         pose: x [m], y [m] and yaw [rad] at the start.
         speed_mps: forward speed at the start.
+        grade: rise over run of the road; the loads of the wheels stay those of a level one.
     """
 
-    def __init__(self, parameters: PlantParameters, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), speed_mps: float = 0.0) -> None:
+    def __init__(
+        self, parameters: PlantParameters, pose: tuple[float, float, float] = (0.0, 0.0, 0.0), speed_mps: float = 0.0, grade: float = 0.0
+    ) -> None:
         self._p = parameters
+        self._downhill_n = parameters.mass_kg * GRAVITY_MPS2 * math.sin(math.atan(grade))
         self._state = PlantState(*pose, speed_mps, 0.0, 0.0, 0.0, 0.0)
         self._wheels = tuple(_Wheel(parameters, is_front, is_left) for is_front in (True, False) for is_left in (True, False))
         self._drive_n = 0.0
@@ -154,7 +158,7 @@ class FourWheelPlant:
         self._brake_n += (p.full_brake_force_n * inputs.brake_norm - self._brake_n) * -math.expm1(-dt_s / p.brake_lag_s)
         engine_drag_n = p.drag_torque_force_n * (1.0 - inputs.accelerator_norm)
         push_n, resist_n, lateral_n, yaw_moment_nm = self._forces(dt_s, inputs.road_wheel_rad, engine_drag_n)
-        push_n -= 0.5 * AIR_DENSITY_KGPM3 * p.drag_area_m2 * before.vx_mps * abs(before.vx_mps)
+        push_n -= 0.5 * AIR_DENSITY_KGPM3 * p.drag_area_m2 * before.vx_mps * abs(before.vx_mps) + self._downhill_n
         floor_mps = max(abs(before.vx_mps), _STANDSTILL_MPS)
         vx_mps = (before.vx_mps + dt_s * (push_n / p.mass_kg + before.yaw_rate_radps * before.vy_mps)) / (
             1.0 + dt_s * resist_n / (p.mass_kg * floor_mps)

@@ -8,6 +8,8 @@ LOST_AFTER_MS = 500.0
 """Age from which a topic counts as lost [ms]; `page/link.js` says the same."""
 SCENE_LOST_AFTER_MS = 2500.0
 """The scene comes once per second only."""
+EVENT_TOPICS = ("parameters",)
+"""These come when something happens, not regularly."""
 
 _LOCKSTEP_STAGES = ("mil", "sil")
 
@@ -57,7 +59,9 @@ class Board:
         return max(0.0, (now_ns - born_ns) * 1e-6)
 
     def is_lost(self, topic: str, now_ns: int) -> bool:
-        """True when a topic that once came has become too old."""
+        """True when a topic that once came has become too old; what comes once per event cannot."""
+        if topic in EVENT_TOPICS:
+            return False
         limit_ms = SCENE_LOST_AFTER_MS if topic == "scene" else LOST_AFTER_MS
         return topic in self.newest and self.age_ms(topic, now_ns) > limit_ms
 

@@ -15,6 +15,7 @@ from gateway.telemetry import (
     DEFAULT_BASE_PORT,
     TOPICS,
     CommandSample,
+    ProfileSample,
     Sample,
     SceneSample,
     StateSample,
@@ -67,12 +68,22 @@ def _state_rows(state: StateSample) -> list[Row]:
 
 def _command_rows(command: CommandSample) -> list[Row]:
     solve_style = "red" if command.solve_time_ms > _SOLVE_BUDGET_MS else ""
-    solved = f"{command.solver}   {command.solve_time_ms:.2f} ms of {_SOLVE_BUDGET_MS:.0f} ms   {command.sqp_iterations} iterations"
+    iterations = f"{command.sqp_iterations} SQP, {command.qp_iterations} QP iterations"
+    solved = f"{command.solver}   {command.solve_time_ms:.2f} ms of {_SOLVE_BUDGET_MS:.0f} ms   {iterations}"
+    rejected = f"   {command.objects_rejected} rejected" if command.objects_rejected else ""
     return [
         ("Command", command.status, "" if command.status == "OK" else "yellow"),
         ("Solver", solved, solve_style),
         ("Tracking", f"lateral {command.lateral_error_m:+.3f} m   speed {command.speed_error_mps * 3.6:+.1f} km/h", ""),
+        ("Disturbance", f"{command.disturbance_mps2:+.2f} m/s²", ""),
+        ("Objects", f"{command.objects} considered{rejected}", "yellow" if rejected else ""),
+        ("Parameters", f"version {command.parameters_version}", ""),
     ]
+
+
+def _profile_row(profile: ProfileSample) -> Row:
+    parts = "   ".join(f"{name} {time_us:.0f}" for name, time_us in profile.time_us.items())
+    return ("Profile", f"{parts}   µs per cycle", "")
 
 
 def _status_rows(status: StatusSample) -> list[Row]:
@@ -121,6 +132,8 @@ def table(board: Board, now_ns: int) -> Group:
         rows += _state_rows(state)
     if command := _newest(board, "command", CommandSample):
         rows += _command_rows(command)
+    if profile := _newest(board, "profile", ProfileSample):
+        rows.append(_profile_row(profile))
     if world := _newest(board, "world", WorldSample):
         rows.append(("Ground truth", f"x {world.x_m:.2f} m   y {world.y_m:.2f} m   {world.vx_mps * 3.6:.1f} km/h", ""))
     grid = Table(box=None, show_header=False, padding=(0, 2, 0, 0))

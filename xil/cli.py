@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import typer
 
+from controller.export.targets import TargetName
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.errors import SetupFailure, UserMistake
 from dbc.realtime import BUS_PRIORITY, become_realtime
@@ -34,6 +35,8 @@ app = typer.Typer(
 )
 bench = typer.Typer(help="Measure: every command prints a table, or with --json one object.", no_args_is_help=True)
 app.add_typer(bench, name="bench")
+params = typer.Typer(help="Look at and change the parameters of a running controller.", no_args_is_help=True)
+app.add_typer(params, name="params")
 
 class OperationName(StrEnum):
     """What an operator can ask for."""
@@ -46,8 +49,11 @@ class OperationName(StrEnum):
 BusOption = Annotated[str, typer.Option("--bus", help="auto, emulated, socketcan:INTERFACE or xilgate:CHANNEL")]
 DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
-PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of four loopback ports for telemetry")]
-SolverOption = Annotated[str, typer.Option("--solver", help="casadi-c, casadi-vm (uncompiled) or riccati (soft bounds)")]
+PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
+SolverOption = Annotated[
+    str | None,
+    typer.Option("--solver", help="riccati (soft bounds), casadi-c or qrqp (hard ones), casadi-vm (uncompiled); default: by the stage"),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object instead of a table")]
 DBC_FILES = [ROBOTS_DBC, GNSS_IMU_DBC]
 
@@ -89,7 +95,7 @@ def drive(
         Stage, typer.Option(help="mil, sil: virtual time; hil: processes in real time; vehil: a car on the bus")
     ] = Stage.HIL,
     bus: BusOption = "auto",
-    solver: Annotated[str | None, typer.Option(help="casadi-c, casadi-vm or riccati; default: what the stage stands for")] = None,
+    solver: SolverOption = None,
     seed: Annotated[int, typer.Option(min=0, help="of all noise")] = 1,
     out: Annotated[Path | None, typer.Option(help="run directory; default: runs/SCENARIO-STAGE")] = None,
     view: Annotated[bool, typer.Option("--view", help="serve the virtual world while driving")] = False,
@@ -143,7 +149,7 @@ def gateway(
 def controller(
     reference: Annotated[Path, typer.Option(help="path to follow, CSV")],
     vehicle: VehicleOption = FOCUS,
-    solver: SolverOption = "casadi-c",
+    solver: SolverOption = None,
     gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
     controller_socket: Annotated[str, typer.Option(help="control socket of the controller")] = "/tmp/xilgate-controller.sock",
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
@@ -156,7 +162,7 @@ def controller(
             vehicle_path=vehicle,
             gateway_socket=gateway_socket,
             controller_socket=controller_socket,
-            solver=solver,
+            solver=solver or m.DEFAULT_SOLVER,
             telemetry_base_port=telemetry_port,
         ),
     )
@@ -169,6 +175,7 @@ def emulator(
     y_m: Annotated[float, typer.Option("--y-m", help="start position")] = 0.0,
     yaw_rad: Annotated[float, typer.Option("--yaw-rad", help="start heading")] = 0.0,
     speed_mps: Annotated[float, typer.Option("--speed-mps", min=0.0, help="start speed")] = 0.0,
+    grade_percent: Annotated[float, typer.Option("--grade-percent", help="how the road climbs where the car points")] = 0.0,
     seed: Annotated[int, typer.Option(min=0)] = 1,
     dbc: DbcOption = DBC_FILES,
     vehicle: VehicleOption = FOCUS,
@@ -183,7 +190,7 @@ def emulator(
             bus_name=bus,
             dbc=tuple(dbc),
             vehicle=vehicle,
-            start=StartPose(x_m, y_m, yaw_rad, speed_mps),
+            start=StartPose(x_m, y_m, yaw_rad, speed_mps, 0.01 * grade_percent),
             seed=seed,
             telemetry_base_port=telemetry_port,
         ),
@@ -240,17 +247,122 @@ def doctor(as_json: JsonOption = False) -> None:
     _print(examination.as_data(checks) if as_json else examination.as_table(checks), as_json)
 
 
-@bench.command("solver")
-def bench_solver(
-    instances: Annotated[int, typer.Option(min=4, help="recorded problems")] = 60,
-    rounds: Annotated[int, typer.Option(min=1, help="times that each is solved by each solver")] = 5,
+@params.command("list")
+def params_list(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """All parameters with value, unit, range and default."""
+    params_get([], telemetry_port, as_json)
+
+
+@params.command("get")
+def params_get(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="parameters; `params list` has them all")],
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve time of every solver, interleaved problem by problem in one process on one core."""
-    from controller import bench as solver_bench  # noqa: PLC0415
+    """Some parameters."""
+    from xil import params as tuner  # noqa: PLC0415
 
-    result = solver_bench.bench_solver(instances=instances, rounds=rounds, progress=_progress)
-    _print(result if as_json else solver_bench.to_table(result), as_json)
+    answer = tuner.values(names, telemetry_port)
+    _print(answer if as_json else tuner.values_table(answer), as_json)
+
+
+@params.command("set")
+def params_set(
+    assignments: Annotated[list[str], typer.Argument(metavar="NAME=VALUE...", help="for example planner.safe_time_s=1.8")],
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Change parameters between two cycles: all that are named, or none when one is refused."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.change(assignments, telemetry_port)
+    _print(answer if as_json else tuner.changes_table(answer), as_json)
+
+
+@params.command("revert")
+def params_revert(
+    what: Annotated[str, typer.Argument(help="number of a change, last or all")] = "last",
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a change back: the parameters that it set get the values from before."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.revert(what, telemetry_port)
+    _print(answer if as_json else tuner.changes_table(answer), as_json)
+
+
+@params.command("history")
+def params_history(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """Who changed what, and when."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.history(telemetry_port)
+    _print(answer if as_json else tuner.history_table(answer), as_json)
+
+
+@params.command("watch")
+def params_watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """Print every change as it comes in force, until interrupted."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    with _stop_on_signal() as stop:
+        tuner.follow(telemetry_port, stop, lambda sample: print(_json(sample) if as_json else tuner.line(sample), flush=True))
+
+
+@app.command()
+def build(
+    target: Annotated[TargetName, typer.Option(help="processor that the library is for")] = TargetName.HOST,
+    export: Annotated[Path | None, typer.Option(help="write C sources with Makefile and checker into this new directory")] = None,
+    vehicle: VehicleOption = FOCUS,
+    as_json: JsonOption = False,
+) -> None:
+    """Compile the controller's solver, or export it as a self-contained C library."""
+    from controller.export import library  # noqa: PLC0415
+
+    if export is None:
+        facts = library.build_for(target, vehicle, _progress)
+    else:
+        from controller.export.directory import export as write_directory  # noqa: PLC0415
+
+        facts = write_directory(export, vehicle, target, _progress)
+    _print(facts if as_json else library.to_table(facts), as_json)
+
+
+@bench.command("solver")
+def bench_solver(
+    sets: Annotated[str, typer.Option("--set", help="nominal, active, hard or all")] = "all",
+    instances: Annotated[int, typer.Option(min=8, help="problems of the nominal set, and of the active one")] = 300,
+    rounds: Annotated[int, typer.Option(min=1, help="times that each is solved by each solver")] = 5,
+    starts: Annotated[int, typer.Option(min=4, help="problems of the hard set")] = 10_000,
+    solver: Annotated[list[str] | None, typer.Option("--solver", help="only this one; repeat for several")] = None,
+    agreement: Annotated[bool, typer.Option("--agreement", help="compare answers as well: some minutes")] = False,
+    callgrind: Annotated[bool, typer.Option("--callgrind", help="count instructions as well; needs valgrind")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Solve time of every solver, interleaved problem by problem in one process on one core, beside its targets."""
+    from controller import bench as solver_bench  # noqa: PLC0415
+    from controller.bench_table import to_table  # noqa: PLC0415
+
+    chosen = solver_bench.SETS if sets == "all" else (sets,)
+    options = solver_bench.BenchOptions(
+        chosen, instances, rounds, starts, tuple(solver or ()), agreement=agreement, callgrind=callgrind
+    )
+    result = solver_bench.bench_solver(options, progress=_progress)
+    _print(result if as_json else to_table(result), as_json)
+
+
+@bench.command("loop")
+def bench_loop(
+    seeds: Annotated[int, typer.Option(min=1, help="of each of the five cases with four times the sensor noise")] = 40,
+    solver: Annotated[str, typer.Option(help="name of a solver")] = "riccati",
+    as_json: JsonOption = False,
+) -> None:
+    """Closed loop in virtual time: noise, slow robots, slopes and a heavy car, each figure beside its target."""
+    from xil import bench_loop as loop_bench  # noqa: PLC0415
+
+    result = loop_bench.bench_loop(solver, seeds, _progress)
+    _print(result if as_json else loop_bench.to_table(result), as_json)
 
 
 @bench.command("gateway")
@@ -270,11 +382,17 @@ def _progress(text: str) -> None:
     print(text, file=sys.stderr)
 
 
+def _json(content: object) -> str:
+    import json  # noqa: PLC0415
+
+    import msgspec  # noqa: PLC0415
+
+    return json.dumps(content, default=msgspec.to_builtins)
+
+
 def _print(content: object, as_json: bool) -> None:
     if as_json:
-        import json  # noqa: PLC0415
-
-        print(json.dumps(content))
+        print(_json(content))
     else:
         from rich.console import Console  # noqa: PLC0415
 

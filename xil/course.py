@@ -207,6 +207,25 @@ def passage(lane: Lane, outline: Outline, x_m: Array, y_m: Array, yaw_rad: Array
     return Passage(*map(float, closest))
 
 
+def separation_m(first: Array, second: Array) -> Array:
+    """Distance between rectangles, pair by pair, shape (n,) [m]; negative where they overlap, by how deep.
+
+    By the separating axis theorem: the widest gap between their shadows on the directions of all sides. Beside each other that is the
+    distance, corner to corner it is a little less.
+
+    Args:
+        first, second: corners in order, shape (n, 4, 2).
+    """
+    widest = np.full(len(first), -np.inf)
+    for corners_m in (first, second):
+        for k in (0, 1):
+            side = corners_m[:, k + 1] - corners_m[:, k]
+            axis = side / np.linalg.norm(side, axis=1, keepdims=True)
+            a, b = (np.einsum("nij,nj->ni", rectangle, axis) for rectangle in (first, second))
+            widest = np.maximum(widest, np.maximum(a.min(axis=1) - b.max(axis=1), b.min(axis=1) - a.max(axis=1)))
+    return widest
+
+
 def _crossings(corners_m: Array, at_x_m: float) -> Array:
     """Where the four sides of rectangles cross a line across x, shape (n, 4, 2); nan where they do not."""
     following = np.roll(corners_m, -1, axis=1)

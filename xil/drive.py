@@ -16,8 +16,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.status import Status
 
+from controller.nmpc import DRIVE_MODEL
 from controller.problem import OcpOptions
-from controller.solvers import LIBRARIES, SOLVERS, make_solver
+from controller.solvers import DEFAULT_SOLVER, LIBRARIES, SOLVERS, make_solver
 from dbc.catalogue import load
 from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import load_vehicle
@@ -34,8 +35,7 @@ from xil.scenario import Stage, load_scenario, scenario_path
 from xil.setup import RunSetup
 from xil.summary import RunFacts, build_summary
 
-COMPILED_SOLVER = "casadi-c"
-SOLVER_OF_STAGE = {Stage.MIL: "casadi-vm", Stage.SIL: COMPILED_SOLVER, Stage.HIL: COMPILED_SOLVER, Stage.VEHIL: COMPILED_SOLVER}
+SOLVER_OF_STAGE = {Stage.MIL: "casadi-vm"} | dict.fromkeys((Stage.SIL, Stage.HIL, Stage.VEHIL), DEFAULT_SOLVER)
 """MiL runs the controller as it was modelled; from SiL on it is the compiled library."""
 OUTCOMES = ("summary.json", "report.html", "bus.log")
 """What a run concludes with; the next one in the same directory starts without them."""
@@ -114,7 +114,7 @@ def _run(setup: RunSetup, options: DriveOptions, display: Display) -> Verdict:
     display.announce(f"driving {setup.scenario.name} at stage {setup.stage.value} with {setup.solver}")
     if setup.stage.is_lockstep:
         recording = Recording(START_NS)
-        solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(), display.announce)
+        solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(model=DRIVE_MODEL), display.announce)
         with _deferred_interrupt() as interrupted:
             interruption = LockstepRun(setup, solver, recording, display.progress, interrupted.is_set).drive()
     else:
@@ -173,7 +173,7 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
     bus = None if options.stage.is_lockstep else choose(options.bus)
     scenario.reference(vehicle)  # refuses a road that leaves the car no room
     GatewayCore(catalogue, vehicle, boot_id=0)  # refuses a DBC that lacks something
-    library = LIBRARIES[solver](vehicle.model, OcpOptions(), display.announce) if solver in LIBRARIES else None
+    library = LIBRARIES[solver](vehicle.model, OcpOptions(model=DRIVE_MODEL), display.announce) if solver in LIBRARIES else None
     return RunSetup(
         scenario, options.stage, vehicle, catalogue, solver, library, bus, options.seed, options.out,
         options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port,
@@ -198,7 +198,7 @@ def _configuration(setup: RunSetup) -> dict[str, object]:
         "bus": setup.bus.name if setup.bus else "lockstep",
         "dbc": [str(path) for path in setup.dbc_paths],
         "vehicle": setup.vehicle.model_dump(),
-        "ocp": asdict(OcpOptions()),
+        "ocp": asdict(OcpOptions(model=DRIVE_MODEL)),
         "limits": asdict(PROVING_GROUND),
     }
 

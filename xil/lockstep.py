@@ -7,7 +7,8 @@ clock, so that a seed determines every frame.
 
 from collections.abc import Callable
 
-from controller.nmpc import Nmpc
+from controller.nmpc import Nmpc, NmpcOptions
+from controller.objects import nearest, report_of
 from controller.samples import command_sample, plan_sample
 from controller.solver import Solver
 from dbc.errors import SetupFailure
@@ -22,6 +23,7 @@ from xil.buslog import BusLog
 from xil.operator import Ending, Operator
 from xil.recording import Recording
 from xil.setup import RunSetup
+from xil.world import World
 
 START_NS = 1_000_000_000
 """Virtual time at which a run begins [ns]; not zero, so that a forgotten zero stands out."""
@@ -36,20 +38,33 @@ Progress = Callable[[StateSample | None], None]
 
 
 class LockstepRun:
-    """One run in virtual time; `drive` does it."""
+    """One run in virtual time; `drive` does it.
+
+    Args:
+        options: of the controller; None for what it drives with otherwise.
+    """
 
     def __init__(
-        self, setup: RunSetup, solver: Solver, recording: Recording, progress: Progress, is_interrupted: Callable[[], bool]
+        self,
+        setup: RunSetup,
+        solver: Solver,
+        recording: Recording,
+        progress: Progress,
+        is_interrupted: Callable[[], bool],
+        *,
+        options: NmpcOptions | None = None,
     ) -> None:
         pose = setup.scenario.start_pose
-        start = StartPose(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps)
+        start = StartPose(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps, 0.01 * setup.scenario.road.grade_percent)
         self._setup = setup
         self._recording = recording
         self._progress = progress
         self._is_interrupted = is_interrupted
         self._emulator = Emulator(setup.vehicle, setup.catalogue, start, setup.seed, START_NS)
+        self._world = World(setup.scenario, setup.vehicle, START_NS)
+        self._objects = self._world.sample(START_NS, 0, pose.x_m, pose.y_m)
         self._gateway = GatewayCore(setup.catalogue, setup.vehicle, _GATEWAY_BOOT_ID)
-        self._nmpc = Nmpc(solver, setup.scenario.reference(setup.vehicle), setup.vehicle, _CONTROLLER_BOOT_ID)
+        self._nmpc = Nmpc(solver, setup.scenario.reference(setup.vehicle), setup.vehicle, _CONTROLLER_BOOT_ID, options)
         self._operator = Operator(setup.scenario.time_limit_s)
         self._solver_name = solver.name
         self._gateway_sampler = GatewaySampler()
@@ -89,7 +104,11 @@ class LockstepRun:
         for frame in frames:
             log.write(frame)
         if now_ns % WORLD_PERIOD_NS == 0:
-            self._recording.add(world_sample(self._emulator.truth(), now_ns, now_ns // WORLD_PERIOD_NS))
+            truth, seq = self._emulator.truth(), now_ns // WORLD_PERIOD_NS
+            self._recording.add(world_sample(truth, now_ns, seq))
+            self._objects = self._world.sample(now_ns, seq, truth.x_m, truth.y_m)
+            if self._objects.objects:
+                self._recording.add(self._objects)
 
     def _step_gateway(self, now_ns: int, log: BusLog) -> Ending | None:
         output = self._gateway.step(now_ns, self._to_gateway, self._command, self._request)
@@ -98,7 +117,8 @@ class LockstepRun:
         for frame in output.frames:
             log.write(frame)
         if now_ns % PLAN_PERIOD_NS == 0:
-            answer = self._nmpc.step(output.state, now_ns)
+            objects = nearest(report_of(self._objects), now_ns, output.state.x_m, output.state.y_m)
+            answer = self._nmpc.step(output.state, now_ns, objects)
             self._command = answer.command
             self._recording.add(command_sample(answer, self._solver_name, answer.command.solve_time_ns))
             if (plan := plan_sample(answer)) is not None:

@@ -1,6 +1,6 @@
 """The judged part of a drive seen from above, in the coordinates of a picture: x to the right, y up, y enlarged on a flat course."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from gateway.telemetry import Lane
 from xil.course import Array, Course, Passage, passage
-from xil.metrics import Trace
+from xil.metrics import Meeting, Trace
 
 WIDTH_PX = 1120
 
@@ -50,6 +50,20 @@ class DrawnGate:
 
 
 @dataclass(frozen=True)
+class DrawnObject:
+    """An object where it was when the car came closest to it.
+
+    Args:
+        label_px: where the label begins.
+    """
+
+    label: str
+    is_touched: bool
+    outline: str
+    label_px: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Map:
     """Everything to draw; lines are SVG path data.
 
@@ -68,6 +82,7 @@ class Map:
     driven: str
     outlines: list[str]
     gates: list[DrawnGate]
+    objects: list[DrawnObject]
     x_ticks: list[Tick]
     y_ticks: list[Tick]
     marker: dict[str, Any]
@@ -98,8 +113,12 @@ class _Scale:
         return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in pixels) + close
 
 
-def draw_map(course: Course, drive: Trace) -> Map:
-    """Draw the judged part of a drive and a little around it."""
+def draw_map(course: Course, drive: Trace, meetings: Sequence[Meeting] = ()) -> Map:
+    """Draw the judged part of a drive and a little around it.
+
+    Args:
+        meetings: the closest approaches to objects.
+    """
     from_m, to_m = course.from_m - _AROUND_M, course.to_m + _AROUND_M
     left_m, right_m, reference_m = (
         _thinned(points_m[(course.station_m >= from_m) & (course.station_m <= to_m)])
@@ -119,23 +138,26 @@ def draw_map(course: Course, drive: Trace) -> Map:
         edges=[scale.path(left_m), scale.path(right_m)],
         reference=scale.path(reference_m),
         driven=scale.path(_thinned(driven_m)) if len(driven_m) else "",
-        outlines=[scale.path(corners_m, "Z") for corners_m in _outlines(course, drive, passages)],
+        outlines=[scale.path(corners_m, "Z") for corners_m in _outlines(course, drive, passages, meetings)],
         gates=[_gate(scale, lane, way) for lane, way in zip(course.lanes, passages, strict=True)],
+        objects=[_object(scale, meeting) for meeting in meetings],
         x_ticks=_ticks(scale.left_m, float(around_m[:, 0].max()), scale.px_per_m, lambda x_m: scale.px(x_m, 0.0)[0]),
         y_ticks=_ticks(bottom_m, scale.top_m, scale.px_per_m * scale.enlargement, lambda y_m: scale.px(0.0, y_m)[1]),
         marker=_marker(course, drive, scale),
     )
 
 
-def _outlines(course: Course, drive: Trace, passages: list[Passage | None]) -> Array:
-    """Corners of the car as it enters each gate, comes closest to it and leaves it, shape (n, 4, 2)."""
+def _outlines(course: Course, drive: Trace, passages: list[Passage | None], meetings: Sequence[Meeting]) -> Array:
+    """Corners of the car as it enters each gate, comes closest to it and leaves it, and beside each object, shape (n, 4, 2)."""
     stations_m = [end_m for lane in course.lanes for end_m in (lane.start_m, lane.end_m)]
     if not course.lanes:
         stations_m = list(np.linspace(course.from_m, course.to_m, _OUTLINES_WITHOUT_GATES))
     reached = [int(np.argmax(drive.along.station_m >= station_m)) for station_m in stations_m if drive.along.station_m.max() >= station_m]
     poses = [(drive.x_m[k], drive.y_m[k], drive.yaw_rad[k]) for k in reached]
     poses += [(way.x_m, way.y_m, way.yaw_rad) for way in passages if way]
-    return course.outline.corners_m(*np.array(poses, dtype=np.float64).reshape(-1, 3).T)
+    times_s = np.array([meeting.t_s for meeting in meetings])
+    beside = np.stack([np.interp(times_s, drive.t_s, column) for column in (drive.x_m, drive.y_m, drive.yaw_rad)])
+    return course.outline.corners_m(*np.concatenate((np.array(poses, dtype=np.float64).reshape(-1, 3).T, beside), axis=1))
 
 
 def _gate(scale: _Scale, lane: Lane, way: Passage | None) -> DrawnGate:
@@ -148,6 +170,16 @@ def _gate(scale: _Scale, lane: Lane, way: Passage | None) -> DrawnGate:
         box_px=(left_px, top_px, right_px - left_px, bottom_px - top_px),
         cones_px=[scale.px(float(x_m), y_m) for y_m in (lane.left_m, lane.right_m) for x_m in along_m],
         contact_px=scale.px(way.contact_x_m, way.contact_y_m) if way else None,
+    )
+
+
+def _object(scale: _Scale, meeting: Meeting) -> DrawnObject:
+    right_m, top_m = meeting.box_m.max(axis=0).tolist()
+    return DrawnObject(
+        label=f"{meeting.name}: {meeting.clearance_m:.3f} m".replace(": -", ": \N{MINUS SIGN}"),
+        is_touched=meeting.clearance_m < 0.0,
+        outline=scale.path(meeting.box_m, "Z"),
+        label_px=scale.px(right_m, top_m),
     )
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from dbc.vehicle import Vehicle
 from gateway.messages import CommandStatus, Mode
 from gateway.modes import Event
-from gateway.telemetry import CommandSample, StatusSample
-from xil.course import STANDSTILL_MPS, Array, Course, Projection, passage
+from gateway.telemetry import CommandSample, ObjectsSample, StatusSample, WorldObject
+from xil.course import STANDSTILL_MPS, Array, Course, Outline, Projection, passage, separation_m
 from xil.recording import ModeChange, Recording
 from xil.scenario import Scenario, Stage
 
@@ -130,6 +130,7 @@ def evaluate(recording: Recording, scenario: Scenario, vehicle: Vehicle, stage: 
         *_completeness(recording, drive, stage),
         *_control(recording, drive, course),
         *_gates(course, drive),
+        *_objects(recording, scenario, course, drive),
         *_arrival(course, drive),
         *_tracking(scenario, course, drive),
         *_counts(recording),
@@ -217,6 +218,55 @@ def _gates(course: Course, drive: Trace) -> Iterator[Metric]:
         way = passage(lane, course.outline, drive.x_m, drive.y_m, drive.yaw_rad)
         failure = f"{lane.name} touched by {-way.clearance_m:.3f} m at x = {way.contact_x_m:.1f} m" if way else f"{lane.name} not reached"
         yield _at_least(f"clearance in {lane.name}", way.clearance_m if way else None, "m", 0.0, failure)
+
+
+def _objects(recording: Recording, scenario: Scenario, course: Course, drive: Trace) -> Iterator[Metric]:
+    limit_m = scenario.judge.object_clearance_m
+    for name in (thing.name for thing in scenario.objects):
+        meeting = closest(recording, name, course, drive)
+        if meeting is None:
+            yield _at_least(f"clearance to {name}", None, "m", limit_m, f"{name} did not appear")
+            continue
+        failure = f"{name} touched" if meeting.clearance_m < 0.0 else f"{name} passed at {meeting.clearance_m:.3f} m, limit {limit_m:g} m,"
+        yield _at_least(f"clearance to {name}", meeting.clearance_m, "m", limit_m, f"{failure} at t = {meeting.t_s:.2f} s")
+
+
+@dataclass(frozen=True)
+class Meeting:
+    """The car and an object when they were closest.
+
+    Args:
+        name: of the object.
+        clearance_m: between their outlines; negative where they overlap.
+        box_m: corners of the object, shape (4, 2).
+    """
+
+    name: str
+    t_s: float
+    clearance_m: float
+    box_m: Array
+
+
+def closest(recording: Recording, name: str, course: Course, drive: Trace) -> Meeting | None:
+    """The closest approach of the car to an object, of all samples of the objects; None when it never was there."""
+    found = [
+        ((sample.t_ns - recording.start_ns) * 1e-9, thing)
+        for sample in recording.samples("objects") if isinstance(sample, ObjectsSample)
+        for thing in sample.objects if thing.name == name
+    ]  # fmt: skip
+    if not found:
+        return None
+    times_s = np.array([t_s for t_s, _ in found])
+    car = course.outline.corners_m(*(np.interp(times_s, drive.t_s, values) for values in (drive.x_m, drive.y_m, drive.yaw_rad)))
+    boxes = np.concatenate([_corners_m(thing) for _, thing in found])
+    clearance_m = separation_m(car, boxes)
+    k = int(np.argmin(clearance_m))
+    return Meeting(name, float(times_s[k]), float(clearance_m[k]), boxes[k])
+
+
+def _corners_m(thing: WorldObject) -> Array:
+    outline = Outline(0.5 * thing.length_m, 0.5 * thing.length_m, 0.5 * thing.width_m)
+    return outline.corners_m(*(np.array([value]) for value in (thing.x_m, thing.y_m, thing.yaw_rad)))
 
 
 def _arrival(course: Course, drive: Trace) -> Iterator[Metric]:

@@ -13,7 +13,7 @@ import msgspec
 from dbc.errors import SetupFailure
 from gateway.channel import Channel
 from gateway.messages import Mode, OperatorRequest
-from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, decode, new_boot_id, port_of
+from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, WorldSample, decode, new_boot_id, port_of
 from vehicle_emulator.bus.channel import is_served
 from xil.buslog import BusListener
 from xil.operator import STANDSTILL_MPS, Advice, Ending, Operator
@@ -21,10 +21,12 @@ from xil.processes import Death, Processes
 from xil.recording import Recording
 from xil.scenario import Stage
 from xil.setup import RunSetup
+from xil.world import World
 
 START_TIMEOUT_S = 30.0
 POLL_S = 0.02
 SCENE_PERIOD_NS = 1_000_000_000
+OBJECTS_PERIOD_NS = 40_000_000
 LINGER_S = 0.3
 """Time after the end in which the last samples arrive [s]."""
 SILENCE_S = 5.0
@@ -55,6 +57,8 @@ class RealtimeRun:
         self._requests = 0
         self._scene = setup.scenario.scene(setup.stage, setup.vehicle, 0, 0)
         self._next_scene_ns = 0
+        self._next_objects_ns = 0
+        self._objects_seq = 0
 
     def drive(self) -> str:
         """Start everything, drive, end everything.
@@ -71,12 +75,14 @@ class RealtimeRun:
         with contextlib.ExitStack() as stack:
             sockets = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xilgate-")))
             scene = stack.enter_context(Publisher(Source.RUNNER, setup.telemetry_base_port))
+            # Without objects of its own a run leaves the port of the world to any tool that brings some.
+            objects = stack.enter_context(Publisher(Source.WORLD, setup.telemetry_base_port)) if setup.scenario.objects else None
             processes = stack.enter_context(Processes(setup.directory))
             stack.enter_context(Subscriber(self._receive, topics, setup.telemetry_base_port))
             self._bring_up(stack, processes, sockets / "gateway", sockets / "controller")
             channel = stack.enter_context(Channel(None, str(sockets / "gateway")))
             try:
-                return self._operate(processes, channel, scene)
+                return self._operate(processes, channel, scene, objects)
             except KeyboardInterrupt:
                 if setup.stage is Stage.VEHIL:
                     self._stop_real_car(processes)
@@ -131,8 +137,9 @@ class RealtimeRun:
         self._await(processes, "gateway", lambda: self._recording.latest("status") is not None)
         self._await(processes, "controller", controller_socket.exists)
         if setup.stage is Stage.HIL:
-            pose = setup.scenario.start_pose
+            pose, grade_percent = setup.scenario.start_pose, setup.scenario.road.grade_percent
             start = ["--x-m", str(pose.x_m), "--y-m", str(pose.y_m), "--yaw-rad", str(pose.yaw_rad), "--speed-mps", str(pose.speed_mps)]
+            start += ["--grade-percent", str(grade_percent)]
             processes.start("emulator", ["emulator", "--bus", bus.name, *start, "--seed", str(setup.seed), *contract])
             self._await(processes, "emulator", lambda: self._recording.latest("world") is not None)
 
@@ -145,8 +152,9 @@ class RealtimeRun:
                 raise SetupFailure(f"{name} did not come up within {START_TIMEOUT_S:.0f} s")
             time.sleep(POLL_S)
 
-    def _operate(self, processes: Processes, channel: Channel, scene: Publisher) -> str:
+    def _operate(self, processes: Processes, channel: Channel, scene: Publisher, objects: Publisher | None) -> str:
         """Play the operator until the run is over; why it was cut short, or nothing."""
+        world = World(self._setup.scenario, self._setup.vehicle, time.monotonic_ns())
         operator = Operator(self._setup.scenario.time_limit_s)
         ending, seen, last_news_s = None, 0, time.monotonic()
         try:
@@ -154,6 +162,8 @@ class RealtimeRun:
                 time.sleep(POLL_S)
                 self._note_deaths(processes)
                 self._post_scene(scene)
+                if objects is not None:
+                    self._post_objects(objects, world)
                 states = [state for state in self._recording.samples("state")[seen:] if isinstance(state, StateSample)]
                 seen += len(states)
                 last_news_s = time.monotonic() if states else last_news_s
@@ -187,6 +197,15 @@ class RealtimeRun:
             self._next_scene_ns = now_ns + SCENE_PERIOD_NS
             self._scene = msgspec.structs.replace(self._scene, t_ns=now_ns, seq=self._scene.seq + 1)
             publisher.post(self._scene)
+
+    def _post_objects(self, publisher: Publisher, world: World) -> None:
+        """Tell what is on the road; where there is no emulated car, its own estimate says how far it has got."""
+        now_ns = time.monotonic_ns()
+        car = self._recording.latest("world") or self._recording.latest("state")
+        if now_ns >= self._next_objects_ns and isinstance(car, WorldSample | StateSample):
+            self._next_objects_ns = max(self._next_objects_ns + OBJECTS_PERIOD_NS, now_ns)
+            self._objects_seq += 1
+            publisher.post(world.sample(now_ns, self._objects_seq, car.x_m, car.y_m))
 
     def _note_deaths(self, processes: Processes) -> None:
         for death in processes.deaths():

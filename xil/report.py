@@ -12,7 +12,7 @@ import visualiser
 from dbc.vehicle import Vehicle
 from xil.course import Array
 from xil.map_view import Map, draw_map
-from xil.metrics import SAMPLE_TIME_MS, Trace, Verdict, trace
+from xil.metrics import SAMPLE_TIME_MS, Trace, Verdict, closest, trace
 from xil.recording import Recording
 from xil.scenario import Scenario, Stage
 
@@ -55,7 +55,8 @@ def write_report(  # noqa: PLR0917 - what a report is made of
     if recording.samples(stage.pose_topic):
         course = scenario.course(vehicle)
         drive = trace(recording, course, stage)
-        the_map = draw_map(course, drive)
+        meetings = [closest(recording, thing.name, course, drive) for thing in scenario.objects]
+        the_map = draw_map(course, drive, [meeting for meeting in meetings if meeting is not None])
     environment = Environment(
         loader=FileSystemLoader(_HERE), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

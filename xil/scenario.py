@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from controller.reference import ReferencePath
@@ -157,10 +157,45 @@ class PathPlan(_Section):
 
 
 class Road(_Section):
-    """Distance from the base line to the edges of the road."""
+    """Distance from the base line to the edges of the road, and how it climbs along the drive."""
 
     left_m: Annotated[float, _between(0.5, 100.0)]
     right_m: Annotated[float, _between(0.5, 100.0)]
+    grade_percent: Annotated[float, _between(-20.0, 20.0)] = 0.0
+
+
+class RoadObject(_Section):
+    """A box on the ground, that stands or drives straight on at one speed; it is there and drives from its appearance on.
+
+    Args:
+        station_m, offset_m: its centre when it appears.
+        heading_deg: from the direction of the base line there, left positive.
+        speed_kmh: along its heading.
+        appears_at_m: station at which the car then is.
+        appears_at_s: time since the start of the run. Without both it is there from the start.
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=80)]
+    station_m: Station
+    offset_m: Lateral
+    length_m: Annotated[float, _between(0.1, 50.0)]
+    width_m: Annotated[float, _between(0.1, 50.0)]
+    heading_deg: Annotated[float, _between(-180.0, 180.0)] = 0.0
+    speed_kmh: Annotated[float, _between(0.0, 250.0)] = 0.0
+    appears_at_m: Station | None = None
+    appears_at_s: Annotated[float, _between(0.0, 600.0)] | None = None
+
+    @model_validator(mode="after")
+    def _appears_once(self) -> Self:
+        if self.appears_at_m is not None and self.appears_at_s is not None:
+            raise PydanticCustomError("fit", "allowed: one of appears_at_m and appears_at_s")
+        return self
+
+    def is_due(self, t_s: float, reached_m: float) -> bool:
+        """Whether it is there, at a time since the start and with the car having got to a station."""
+        if self.appears_at_m is not None:
+            return reached_m >= self.appears_at_m
+        return t_s >= (self.appears_at_s or 0.0)
 
 
 class Gate(_Section):
@@ -185,6 +220,7 @@ class Judgement(_Section):
 
     Args:
         from_m, to_m: stations between which tracking is judged; the car must get past `to_m`.
+        object_clearance_m: least distance from the car's outline to an object.
     """
 
     from_m: Station
@@ -195,6 +231,7 @@ class Judgement(_Section):
     heading_error_max_deg: Limit | None = None
     speed_error_rms_mps: Limit | None = None
     lateral_acceleration_max_mps2: Limit | None = None
+    object_clearance_m: Limit = 0.0
 
 
 class Scenario(_Section):
@@ -208,10 +245,12 @@ class Scenario(_Section):
     path: PathPlan
     road: Road
     gates: list[Gate] = []
+    objects: list[RoadObject] = []
     judge: Judgement
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
+        end_m = self.speed.stop_m + RUN_OUT_M
         start_m, judge, is_slow = self.path.start_m, self.judge, self.start.speed_kmh < self.speed.cruise_kmh
         for is_wrong, rule in (
             (self.start.speed_kmh > self.speed.cruise_kmh, "start.speed_kmh of at most speed.cruise_kmh"),
@@ -220,6 +259,8 @@ class Scenario(_Section):
             (judge.to_m > self.speed.brake_from_m, f"judge.to_m before the stop begins, at {self.speed.brake_from_m:.1f}"),
             (bool(self.gates and self.path.curves), "gates only on a straight base line, without path.curves"),
             (any(g.start_m < start_m or g.end_m > judge.to_m for g in self.gates), "gates only between path.start_m and judge.to_m"),
+            (len({thing.name for thing in self.objects}) < len(self.objects), "objects only with names that differ"),
+            (any(not start_m <= thing.station_m <= end_m for thing in self.objects), f"objects only from path.start_m to {end_m:g}"),
         ):
             if is_wrong:
                 raise PydanticCustomError("fit", "allowed: {rule}", {"rule": rule})

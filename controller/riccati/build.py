@@ -4,7 +4,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from controller.build import Build, Recipe, build_from
+from controller.build import Build, Compiler, Recipe, build_from
 from controller.problem import OcpOptions
 from dbc.vehicle import ModelParameters
 
@@ -18,25 +18,30 @@ _AVX2 = ("-mavx2", "-mfma")
 
 _KEYED_SOURCES = (
     *("build.py", "integrator.py", "model.py", "ocp.py", "problem.py"),
-    *("riccati/build.py", "riccati/emit.py", "riccati/stage.py"),
+    *("riccati/build.py", "riccati/emit.py", "riccati/printer.py", "riccati/stage.py"),
 )
 
 
 def build_riccati(
-    car: ModelParameters, options: OcpOptions, progress: Callable[[str], None], target_flags: tuple[str, ...] | None = None
+    car: ModelParameters,
+    options: OcpOptions,
+    progress: Callable[[str], None],
+    target_flags: tuple[str, ...] | None = None,
+    compiler: Compiler | None = None,
 ) -> Build:
     """The library for one car and one problem, from the cache or new.
 
     Args:
         progress: told in one line each what takes time.
         target_flags: what the code may use of the processor; None for what this machine has.
+        compiler: None for that of this machine.
 
     Raises:
         BuildError: no compiler, no place to write, or the compiler refuses.
     """
     flags = (*FLAGS, *(host_flags() if target_flags is None else target_flags))
     sources = tuple(f"riccati/c/{path.name}" for path in sorted(C_SOURCES.iterdir()))
-    return build_from(Recipe(car, options, (*_KEYED_SOURCES, *sources), flags, write_sources), progress)
+    return build_from(Recipe(car, options, (*_KEYED_SOURCES, *sources), flags, write_sources), progress, compiler)
 
 
 def host_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:

@@ -1,138 +1,87 @@
-"""Prints CasADi's SX functions as C functions that work on several stages at once, and the sizes of the problem.
+"""Writes what is generated of the C code: sizes and structure of the problem, and the stage functions of its model.
 
-An SX function is a list of scalar instructions. Each becomes one line of C on the type `lanes` (see `c/lanes.h`): one double, or
-two or four of them, one for each of as many stages. A result is never overwritten, a divisor is inverted once, and sine and cosine
-of the same angle are computed together.
+An evaluation of the model and the way back through it are one function for CasADi and two for C, because all other evaluations of the
+Runge-Kutta method lie between them; `c/stage.c` has them in a loop, so that the code of a stage fits into an instruction cache.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 
 import casadi as ca
 
-from controller.ocp import advance_function
-from controller.problem import OcpOptions
-from controller.riccati.stage import stage_functions
-from dbc.errors import SetupFailure
+from controller.problem import Model, OcpOptions
+from controller.riccati.printer import Phase, Printed
+from controller.riccati.stage import stage_parts
 from dbc.vehicle import ModelParameters
 
 SIZES_NAME = "problem_size.h"
 HEADER_NAME = "stage_functions.h"
 SOURCE_NAME = "stage_functions.c"
 
-_BINARY = {ca.OP_ADD: "+", ca.OP_SUB: "-", ca.OP_MUL: "*"}
-_UNARY: dict[int, str] = {
-    ca.OP_NEG: "-{0}",
-    ca.OP_SQ: "{0} * {0}",
-    ca.OP_TWICE: "{0} + {0}",
-    ca.OP_SQRT: "lanes_sqrt({0})",
-    ca.OP_ATAN: "lanes_atan({0})",
-}
-
-
-class EmitError(SetupFailure):
-    """A model uses an operation that the printer does not know."""
+_PLAIN_PHASES = (
+    Phase("plain_constants", ("u",), (), "constants"),
+    Phase("plain_forward", ("point",), ("k",), "tape"),
+    Phase("plain_backward", ("k_bar",), ("point_bar", "input_bar")),
+)
+_CURVED_PHASES = (
+    Phase("curved_constants", ("u",), (), "constants"),
+    Phase("curved_forward", ("point", "sensitivity"), ("k", "k_sensitivity"), "tape"),
+    Phase("curved_backward", ("k_bar", "curvature"), ("point_bar", "input_bar", "curvature_sum")),
+)
 
 
 def write_stage_functions(directory: Path, car: ModelParameters, options: OcpOptions) -> None:
     """Write sizes, declarations and definitions of the stage functions of one car and one problem into `directory`."""
-    adjoint, derivatives = stage_functions(car, options)
-    functions = [adjoint, derivatives, advance_function(car, options)]
-    patterns = {name: derivatives.sparsity_out(name) for name in ("jacobian", "hessian")}
-    sizes = {"HORIZON_STEPS": options.horizon_steps, "N_STATES": options.model.n_states, "N_INPUTS": options.model.n_inputs}
-    _write(directory / SIZES_NAME, [f"#define {name} {size}" for name, size in sizes.items()])
-    header = ['#include "lanes.h"']
-    for name, pattern in patterns.items():
-        header += [f"#define {name.upper()}_NONZEROS {pattern.nnz()}"]
-        header += [f"extern const unsigned char {name}_{axis}[{name.upper()}_NONZEROS];" for axis in ("row", "column")]
-    _write(directory / HEADER_NAME, header + [f"{_signature(function)};" for function in functions])
+    parts = stage_parts(car, options.model)
+    printed = [Printed.of(function, (_whole(function),)) for function in (parts.begin, parts.plain_end, parts.curved_end)]
+    printed += [Printed.of(parts.plain, _PLAIN_PHASES), Printed.of(parts.curved, _CURVED_PHASES)]
+    patterns = {name: parts.curved_end.sparsity_out(name) for name in ("jacobian", "hessian")}
+    sizes = {"INTEGRATOR_STEPS": str(options.integrator_steps), "SAMPLE_TIME_S": repr(options.sample_time_s)}
+    sizes |= {f"{name.upper()}_NONZEROS": str(parts.curved.nnz_in(name)) for name in ("sensitivity", "curvature")}
+    sizes |= {f"{name.upper()}_NONZEROS": str(pattern.nnz()) for name, pattern in patterns.items()}
+    for functions in printed:
+        sizes |= {name: str(size) for name, size in functions.tape_sizes.items()}
+    tables = {f"{name}_place": list(zip(*pattern.get_triplet(), strict=True)) for name, pattern in patterns.items()}
+    tables["hessian_mirrored_place"] = [(column, row) for row, column in tables["hessian_place"]]
+    _write(directory / SIZES_NAME, _defines(problem_sizes(options.model, options.horizon_steps)))
+    header = ['#include "stage_vector.h"', *_defines(problem_structure(options.model) | sizes)]
+    header += [f"extern const unsigned short {name}[{len(places)}];" for name, places in tables.items()]
+    _write(directory / HEADER_NAME, header + [f"{signature};" for functions in printed for signature, _ in functions.definitions])
     source = [f'#include "{HEADER_NAME}"']
-    for name, pattern in patterns.items():
-        for axis, places in zip(("row", "column"), pattern.get_triplet(), strict=True):
-            source += [f"const unsigned char {name}_{axis}[{name.upper()}_NONZEROS] = {{{', '.join(map(str, places))}}};"]
-    for function in functions:
-        source += c_function(function)
+    for name, places in tables.items():
+        source += [f"const unsigned short {name}[{len(places)}] = {{{', '.join(f'{i} * STAGE_ROOM + {j}' for i, j in places)}}};"]
+    for functions in printed:
+        for signature, lines in functions.definitions:
+            source += [signature, "{", *lines, "}"]
     _write(directory / SOURCE_NAME, source)
 
 
-def c_function(function: ca.Function) -> list[str]:
-    """Lines of the C function that computes what an SX function does.
+def problem_sizes(model: Model, horizon_steps: int) -> dict[str, str]:
+    """What the public header has to know of a problem."""
+    return {
+        "HORIZON_STEPS": str(horizon_steps),
+        "N_STATES": f"{model.n_states} /* {', '.join(model.states)} */",
+        "N_INPUTS": f"{model.n_inputs} /* {', '.join(model.inputs)} */",
+    }
 
-    Raises:
-        EmitError: it contains an operation that is not known here.
-    """
-    return [_signature(function), "{", *_Body(function).lines, "}"]
+
+def problem_structure(model: Model) -> dict[str, str]:
+    """What the solver has to know of a problem besides: which components of (x, u) have bounds at every stage, inputs first; position."""
+    bounded = [*range(model.n_states, model.n_states + model.n_inputs), *model.bounded_index]
+    x, y = model.position_index
+    places = {"BOUNDED_COMPONENTS": ", ".join(map(str, bounded)), "X_COMPONENT": str(x), "Y_COMPONENT": str(y)}
+    return {"N_BOUNDED": str(len(bounded))} | places
+
+
+def _defines(sizes: dict[str, str]) -> list[str]:
+    return [f"#define {name} {size}" for name, size in sizes.items()]
 
 
 def _write(path: Path, lines: list[str]) -> None:
-    guard = [f"/* Generated by {__name__}. */"]
+    guard = ["/* Generated by controller.riccati.emit. */"]
     if path.suffix == ".h":
         guard += ["#pragma once"]
     path.write_text("\n".join([*guard, *lines]) + "\n", encoding="utf-8")
 
 
-def _signature(function: ca.Function) -> str:
-    inputs = [f"const lanes *restrict {name}" for name in function.name_in()]
-    outputs = [f"lanes *restrict {name}" for name in function.name_out()]
-    return f"void {function.name()}({', '.join(inputs + outputs)})"
-
-
-class _Body:
-    """The lines of one function.
-
-    Args:
-        function: SX function; CasADi numbers its work registers, and reuses them.
-    """
-
-    def __init__(self, function: ca.Function) -> None:
-        self.lines: list[str] = []
-        self._values: dict[int, str] = {}  # what each register holds now: a name, or a literal
-        self._reciprocals: dict[str, str] = {}
-        self._angles: dict[str, str] = {}
-        self._count = 0
-        names_in, names_out = function.name_in(), function.name_out()
-        for k in range(function.n_instructions()):
-            operation, inputs, outputs = function.instruction_id(k), function.instruction_input(k), function.instruction_output(k)
-            if operation == ca.OP_OUTPUT:
-                self.lines.append(f"    {names_out[outputs[0]]}[{outputs[1]}] = lanes_of({self._values[inputs[0]]});")
-            elif operation == ca.OP_INPUT:
-                self._values[outputs[0]] = self._new(f"{names_in[inputs[0]]}[{inputs[1]}]")
-            elif operation == ca.OP_CONST:
-                self._values[outputs[0]] = f"({float(function.instruction_constant(k))!r})"
-            else:
-                self._values[outputs[0]] = self._result(operation, [self._values[i] for i in inputs])
-
-    def _result(self, operation: int, operands: list[str]) -> str:
-        special: dict[int, Callable[[], str]] = {
-            ca.OP_DIV: lambda: self._new(f"{operands[0]} * {self._reciprocal(operands[1])}"),
-            ca.OP_INV: lambda: self._reciprocal(operands[0]),
-            ca.OP_SIN: lambda: f"{self._angle(operands[0])}_sin",
-            ca.OP_COS: lambda: f"{self._angle(operands[0])}_cos",
-        }
-        if operation in special:
-            return special[operation]()
-        if operation in _BINARY:
-            return self._new(f"{operands[0]} {_BINARY[operation]} {operands[1]}")
-        if operation in _UNARY:
-            return self._new(_UNARY[operation].format(operands[0]))
-        raise EmitError(f"CasADi operation {operation}: no C code is known for it")
-
-    def _new(self, expression: str) -> str:
-        name = f"t{self._count}"
-        self._count += 1
-        self.lines.append(f"    const lanes {name} = {expression};")
-        return name
-
-    def _reciprocal(self, divisor: str) -> str:
-        if divisor.startswith("("):
-            return f"(1.0 / {divisor})"
-        if divisor not in self._reciprocals:
-            self._reciprocals[divisor] = self._new(f"1.0 / {divisor}")
-        return self._reciprocals[divisor]
-
-    def _angle(self, angle: str) -> str:
-        if angle not in self._angles:
-            name = f"angle{len(self._angles)}"
-            self.lines += [f"    lanes {name}_sin, {name}_cos;", f"    lanes_sincos({angle}, &{name}_sin, &{name}_cos);"]
-            self._angles[angle] = name
-        return self._angles[angle]
+def _whole(function: ca.Function) -> Phase:
+    return Phase(function.name(), tuple(function.name_in()), tuple(function.name_out()))

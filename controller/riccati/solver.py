@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from controller.problem import Array, OcpOptions
-from controller.solver import DUAL_TOLERANCE, PRIMAL_TOLERANCE, Effort, NlpBuffers, SolverError, SqpSolver
+from controller.solver import DUAL_TOLERANCE, PRIMAL_TOLERANCE, Effort, NlpBuffers, SolverError, SqpSolver, SubFunction
 
 PENALTY_LINEAR = 500.0
 PENALTY_QUADRATIC = 400.0
@@ -34,17 +34,28 @@ class _Problem(ctypes.Structure):
     ]
 
 
+class _Part(ctypes.Structure):
+    """`nmpc_part` of nmpc.h."""
+
+    _fields_: ClassVar = [("time_ns", ctypes.c_int64), ("calls", ctypes.c_int)]
+
+
+PARTS = {"stage_sweep": "stage sweep", "adjoint_sweep": "gradient", "qp": "qp"}
+"""Fields of `nmpc_statistics`, and their names in `controller.solver.PROFILE_PARTS`."""
+
+
 class _Statistics(ctypes.Structure):
     """`nmpc_statistics` of nmpc.h."""
 
     _fields_: ClassVar = [
         *((name, ctypes.c_int) for name in ("status", "sqp_iterations", "qp_iterations", "factorizations")),
         *((name, _Real) for name in ("work", "primal_residual", "dual_residual")),
+        *((name, _Part) for name in PARTS),
     ]
 
 
 class RiccatiBackEnd:
-    """The library's functions on the shared buffers.
+    """The library's functions on the shared buffers; `address` is that of the solver's memory.
 
     Raises:
         SolverError: the file is no library of this solver, or one for another problem.
@@ -62,6 +73,7 @@ class RiccatiBackEnd:
             raise SolverError(f"{library_path}: for {sizes} variables, constraints and parameters, not {[b.w.size, b.g.size, b.p.size]}")
         library.nmpc_solver_bytes.restype = library.nmpc_solver_alignment.restype = ctypes.c_size_t
         self._memory, memory = _aligned(library.nmpc_solver_bytes(), library.nmpc_solver_alignment())
+        self.address = memory
         problem = _Problem(
             *map(_address, (b.w0, b.lam_w0, b.lam_g0, b.p, b.lower_w, b.upper_w, b.lower_g, b.upper_g)), PENALTY_LINEAR, PENALTY_QUADRATIC
         )
@@ -78,7 +90,9 @@ class RiccatiBackEnd:
         """Solve the programme; SQP iterations, and Newton steps of all its quadratic programmes."""
         self.statistics = self._solve(*self._solve_arguments)
         s = self.statistics
-        return Effort(s.sqp_iterations, s.qp_iterations, s.work)
+        parts = ((part, getattr(s, field)) for field, part in PARTS.items())
+        profile = {part: SubFunction(share.time_ns, share.calls) for part, share in parts}
+        return Effort(s.sqp_iterations, s.qp_iterations, s.work, profile)
 
     def check(self) -> None:
         """Compute constraints and gradient of the Lagrangian at the answer."""

@@ -9,7 +9,6 @@ from controller.planner import Planner, PlannerOptions
 from controller.problem import Horizon, OcpOptions
 from controller.reference import ReferencePath
 from controller.solver import SqpSolver
-from controller.solvers import make_solver
 from dbc.vehicle import load_vehicle
 
 
@@ -26,17 +25,6 @@ def library(vehicle):
 @pytest.fixture
 def solver(library):
     return SqpSolver("casadi-c", OcpOptions(), lambda buffers: CompiledBackEnd(library, buffers))
-
-
-@pytest.fixture(scope="session")
-def _interpreted(vehicle):
-    return make_solver("casadi-vm", vehicle.model, OcpOptions(), print)
-
-
-@pytest.fixture
-def interpreted(_interpreted):
-    _interpreted.reset()
-    return _interpreted
 
 
 @pytest.fixture(scope="session")

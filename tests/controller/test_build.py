@@ -1,4 +1,4 @@
-"""The library cache, the compilers, and the counters patched into generated code. No test here runs a real compiler."""
+"""The library cache and the compilers. No test here runs a real compiler."""
 
 import sys
 from pathlib import Path
@@ -7,7 +7,6 @@ import pytest
 
 from controller import build as builder
 from controller.build import BuildError, build, cache_directory, find_compiler
-from controller.codegen import CodegenError, with_counters
 from controller.problem import OcpOptions
 from dbc.errors import SetupFailure
 
@@ -36,7 +35,7 @@ def fake(tmp_path, monkeypatch):
         monkeypatch.setenv("CC", str(path))
 
     install()
-    monkeypatch.setattr("controller.codegen.generate", lambda path, car, options: path.write_text("int x;\n"))
+    monkeypatch.setattr("controller.codegen.generate", lambda path, *made_from: path.write_text("int x;\n"))
     install.runs = lambda: (tmp_path / "log").read_text().count("run") if (tmp_path / "log").exists() else 0
     return install
 
@@ -85,10 +84,11 @@ def test_changed_sources_mean_a_new_library(fake, vehicle, monkeypatch):
 
 def test_every_module_that_the_code_comes_from_is_in_the_key():
     sources = Path(builder.__file__).parent
-    for name in builder._KEYED_SOURCES:
-        for line in (sources / name).read_text().splitlines():
-            if line.startswith("from controller.") and name != "build.py":
-                assert f"{line.split()[1].removeprefix('controller.')}.py" in builder._KEYED_SOURCES
+    for keyed in (builder._KEYED_SOURCES, builder._KEYED_SOURCES + builder._QRQP_SOURCES):
+        for name in keyed:
+            for line in (sources / name).read_text().splitlines():
+                if line.startswith("from controller.") and name != "build.py":
+                    assert f"{line.split()[1].removeprefix('controller.').replace('.', '/')}.py" in keyed
 
 
 def test_a_damaged_library_is_made_anew(fake, vehicle):
@@ -145,7 +145,7 @@ def test_without_a_system_compiler_ziglang_is_taken(monkeypatch, tmp_path):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr(builder.importlib.util, "find_spec", lambda name: object())
-    monkeypatch.setattr(builder, "_version_of", lambda command: "clang 20" if "ziglang" in command else "")
+    monkeypatch.setattr(builder, "compiler_at", lambda command: builder.Compiler(command, "clang 20") if "ziglang" in command else None)
     compiler = find_compiler()
     assert compiler.command[1:4] == ("-m", "ziglang", "cc")
     assert "-mcpu=baseline" in compiler.command
@@ -157,18 +157,3 @@ def test_a_place_that_cannot_be_written_is_named(fake, vehicle, monkeypatch, tmp
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
     with pytest.raises(BuildError, match="cannot write the library cache"):
         build(vehicle.model, OcpOptions(), print)
-
-
-GENERATED = "start\n    iter_count++;\nmiddle\n  d_qp.iter_count = d.iter;\nend\n"
-
-
-def test_counters_are_put_where_the_iterations_are_counted():
-    lines = with_counters(GENERATED).splitlines()
-    assert lines[lines.index("    iter_count++;") + 1].strip() == "xilgate_counters[0]++;"
-    assert lines[lines.index("  d_qp.iter_count = d.iter;") + 1].strip() == "xilgate_counters[1] += d.iter;"
-
-
-@pytest.mark.parametrize("source", ["", GENERATED.replace("iter_count++", "k++"), GENERATED + GENERATED])
-def test_code_of_another_form_is_refused(source):
-    with pytest.raises(CodegenError, match="expected one"):
-        with_counters(source)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from controller.integrator import rk4_step
 from controller.model import single_track, slip_speed
 from controller.ocp import advance_function, stage_function
-from controller.problem import OcpOptions
+from controller.problem import SINGLE_TRACK, SINGLE_TRACK_LAG, OcpOptions
 from dbc.vehicle import load_vehicle
 
 CAR = load_vehicle().model
@@ -113,3 +113,56 @@ def test_the_stage_is_stable_down_to_standstill(v_x):
 
 def _stage(x, u):
     return np.array(_STAGE(x, u)).ravel()
+
+
+VARIANTS = {model.name: model for model in (SINGLE_TRACK, SINGLE_TRACK_LAG)}
+
+
+@pytest.fixture(scope="module", params=VARIANTS)
+def sampled(request):
+    """One sample of a model with its Jacobian, and the Hessian of the sum of all states after it."""
+    model = VARIANTS[request.param]
+    stage = stage_function(CAR, OcpOptions(model=model))
+    x, u = ca.MX.sym("x", model.n_states), ca.MX.sym("u", model.n_inputs)
+    after = stage(x, u)
+    hessian = ca.hessian(ca.sum1(after), x)[0]
+    return model, ca.Function("sampled", [x, u], [after, ca.jacobian(after, x), hessian])
+
+
+@pytest.mark.parametrize("v_x", [0.0, 0.1, 0.5, 0.8, 1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 20.0, 28.0, 36.0])
+def test_the_sampled_map_is_stable_from_standstill_to_130_kmh(sampled, v_x):
+    """Where continuous motion dies out, so does the sampled one: every lateral and actuator mode, from any angle of the wheels."""
+    model, evaluate = sampled
+    for delta in (0.0, 0.1 if v_x < 10.0 else 0.02):
+        hold = (200.0 + 0.4 * v_x**2) / (1500.0 / 0.31)
+        x = np.zeros(model.n_states)
+        x[0], x[6:] = v_x, (delta, hold)[: model.n_states - 6]
+        jacobian = np.array(evaluate(x, (delta, hold))[1])
+        moving = [k for k, name in enumerate(model.states) if name not in ("X", "Y", "psi")]
+        radius = np.abs(np.linalg.eigvals(jacobian[np.ix_(moving, moving)])).max()
+        assert radius < 1.01  # v_x by itself hardly decays: air drag
+
+
+@given(data=st.data())
+def test_gradients_are_finite_at_any_speed(sampled, data):
+    model, evaluate = sampled
+    x, u = data.draw(states), data.draw(inputs)
+    actuators = np.array((*data.draw(inputs),))[: model.n_states - 6]
+    x[0] = data.draw(st.floats(-1.0, 36.0))
+    for value in evaluate(np.concatenate((x, actuators)), u):
+        assert np.isfinite(np.array(value)).all()
+
+
+def test_actuators_follow_their_commands_as_lags_of_first_order():
+    advance = advance_function(CAR, OcpOptions(model=SINGLE_TRACK_LAG))
+    x = np.array((20.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+    for _ in range(5):
+        x = np.array(advance(x, (0.02, 0.5), 0.04)).ravel()
+    assert x[6:] == pytest.approx((0.02 * (1 - np.exp(-0.2 / CAR.steer_lag_s)), 0.5 * (1 - np.exp(-0.2 / CAR.drive_lag_s))), rel=1e-3)
+
+
+def test_behind_actuators_at_rest_the_car_is_the_same():
+    """With actuators where their commands are, both models move alike."""
+    x, u = np.array((16.0, 0.3, 0.2, 3.0, 4.0, 0.5)), np.array((0.04, 0.3))
+    advance = advance_function(CAR, OcpOptions(model=SINGLE_TRACK_LAG))
+    np.testing.assert_allclose(np.array(advance(np.concatenate((x, u)), u, 0.04)).ravel()[:6], _stage(x, u), rtol=1e-12)

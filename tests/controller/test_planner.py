@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from controller.ocp import stage_function
 from controller.planner import Localiser, Planner, PlannerOptions, lateral_offset, steady_sideslip
 from controller.problem import OcpOptions
 from controller.reference import ReferencePath
+from controller.reference_sources import reference_from_curvature
 from dbc.vehicle import load_vehicle
 
 CAR = load_vehicle().model
@@ -96,6 +97,42 @@ def test_on_the_way_back_along_the_same_line_the_heading_decides():
     path = path_of(x, y)
     assert Localiser(path).locate(20.0, 0.9, 0.0, 0.0) == pytest.approx(20.0, abs=0.5)
     assert Localiser(path).locate(20.0, -0.9, np.pi, 0.0) > 60.0
+
+
+def hairpins():
+    """Four straights of 40 m side by side, 4 m apart, and the half circles between them."""
+    s_m, curvature = [0.0], [0.0]
+    for k in range(3):
+        turn = 0.5 if k % 2 == 0 else -0.5
+        for length, bend in ((40.0, 0.0), (0.01, turn), (2.0 * np.pi - 0.01, turn), (0.01, 0.0)):
+            s_m.append(s_m[-1] + length)
+            curvature.append(bend)
+    s_m.append(s_m[-1] + 40.0)
+    curvature.append(0.0)
+    return reference_from_curvature(s_m, curvature, np.full(len(s_m), 5.0), 1.5)
+
+
+@pytest.mark.parametrize("path", [bends(), figure_of_eight(), hairpins()], ids=["bends", "figure of eight", "hairpins"])
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0.5, 12.0), st.floats(0.0, 0.5), st.floats(-0.8, 0.8))
+def test_the_closest_point_follows_the_car_along_any_path(path, seed, speed_mps, noise_m, beside_m):
+    """It stays on its branch, with noise and off the path, while the car drives all of it and at times rolls back a little."""
+    rng, localiser, arc = np.random.default_rng(seed), Localiser(path), path.arc_length_m
+    at, last = 0.0, 0.0
+    while at < arc[-1] - 1.0:
+        x, y, yaw = (np.interp(at, arc, values) for values in (path.x_m, path.y_m, path.yaw_rad))
+        off_x, off_y = noise_m * rng.uniform(-1.0, 1.0, 2)
+        reach_m = speed_mps * 0.2 + 2.0
+        found = localiser.locate(x - beside_m * np.sin(yaw) + off_x, y + beside_m * np.cos(yaw) + off_y, float(yaw), reach_m)
+        assert last <= found <= last + reach_m + at * (last == 0.0)
+        assert abs(found - at) < 0.2 + 2.5 * noise_m + 0.5 * abs(beside_m)
+        last = found
+        at = max(at + speed_mps * 0.2 * (1.0 if rng.random() > 0.1 else -0.03), 0.0)
+
+
+def test_a_car_that_rolls_back_keeps_its_place():
+    localiser = Localiser(straight(5.0))
+    assert [localiser.locate(x, 0.0, 0.0, 2.0) for x in (20.0, 20.5, 20.2, 19.9, 20.6)] == pytest.approx([20.0, 20.5, 20.5, 20.5, 20.6])
 
 
 def test_after_a_reset_the_whole_path_is_searched():

@@ -6,13 +6,12 @@ import time
 
 import pytest
 
-from gateway.telemetry import TOPICS, Publisher, Source, Subscriber, TelemetryError, WorldObject, WorldSample, decode, port_of, topic_of
+from gateway.telemetry import TOPICS, Publisher, Source, Subscriber, TelemetryError, WorldSample, decode, port_of, topic_of
 from tests.support.processes import free_base_port, wait_until
 
 WORLD = WorldSample(
     t_ns=1, seq=2, x_m=1.5, y_m=-2.5, yaw_rad=0.1, vx_mps=22.2, vy_mps=0.0, yaw_rate_radps=0.0, ax_mps2=0.0, ay_mps2=0.0, sr_angle_rad=0.2,
     ar_position_norm=0.1, br_position_norm=0.0, robots_engaged=True,
-    objects=[WorldObject(name="dummy", x_m=30.0, y_m=0.0, yaw_rad=0.0, length_m=4.0, width_m=1.8)],
 )
 
 

@@ -8,12 +8,14 @@ import sys
 import time
 from pathlib import Path
 
+from gateway.telemetry import Source
+
 
 def free_base_port() -> int:
-    """First of four consecutive loopback ports that are free now."""
+    """First of neighbouring loopback ports, one for each source, that are free now."""
     for base in range(20000 + os.getpid() % 20000, 60000, 7):
         try:
-            for port in range(base, base + 4):
+            for port in range(base, base + len(Source)):
                 with socket.socket() as probe:
                     probe.bind(("127.0.0.1", port))
         except OSError:

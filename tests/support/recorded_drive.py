@@ -94,7 +94,7 @@ class RecordedDrive:
         pedals = {"ar_position_norm": max(drive_norm, 0.0), "br_position_norm": max(-drive_norm, 0.0) / 3.0}
         self._add(
             WorldSample, "world", t_s, **pose, ay_mps2=speed_mps**2 * curvature_radpm, sr_angle_rad=steer_rad, **pedals,
-            robots_engaged=mode == "ENGAGED", objects=[],
+            robots_engaged=mode == "ENGAGED",
         )
         self._add(
             StateSample, "state", t_s, mode=mode, is_valid=True, **pose, sr_angle_rad=steer_rad, **pedals,
@@ -105,7 +105,8 @@ class RecordedDrive:
             self._add(
                 CommandSample, "command", t_s, state_seq=k, status=self._command_status(t_s), solver="casadi-c", steer_rad=steer_rad / 14.7,
                 drive_norm=drive_norm, solve_time_ms=self._solve_time_ms(t_s), step_time_ms=self._solve_time_ms(t_s) + 0.2,
-                sqp_iterations=2, primal_residual=1e-9, dual_residual=1e-6, lateral_error_m=left_m, speed_error_mps=0.0,
+                sqp_iterations=2, qp_iterations=4, work=-1, primal_residual=1e-9, dual_residual=1e-6, lateral_error_m=left_m,
+                speed_error_mps=0.0, disturbance_mps2=0.0, parameters_version=0, objects=0, objects_rejected=0,
             )
         if k % STATUS_EVERY_STEPS == 0 or is_new_mode:
             left = self._leaves_engaged

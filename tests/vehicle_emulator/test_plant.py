@@ -239,3 +239,17 @@ def test_a_sideways_slide_at_walking_pace_comes_to_rest():
     state = drive(plant, 3.0, PlantInputs(0.0, 0.0, 0.3))
     assert abs(state.vy_mps) < 1e-3
     assert abs(state.yaw_rate_radps) < 1e-3
+
+
+@pytest.mark.parametrize("grade", [0.06, -0.06])
+def test_a_slope_pulls_with_its_share_of_the_weight(grade: float):
+    level, inclined = (drive(FourWheelPlant(P, speed_mps=20.0, grade=g), 1.0, COAST) for g in (0.0, grade))
+    expected_mps2 = -GRAVITY_MPS2 * grade / math.hypot(1.0, grade)
+    assert inclined.vx_mps - level.vx_mps == pytest.approx(expected_mps2, rel=0.05)
+    assert inclined.y_m == level.y_m == 0.0
+
+
+def test_a_brake_holds_the_car_on_a_slope_and_without_one_it_rolls_back():
+    held = drive(FourWheelPlant(P, grade=0.06), 10.0, PlantInputs(0.0, 0.0, 0.3))
+    assert abs(held.x_m) < 1e-3
+    assert drive(FourWheelPlant(P, grade=0.06), 2.0, COAST).vx_mps < -0.3

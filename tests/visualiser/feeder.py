@@ -15,7 +15,11 @@ from gateway.telemetry import (
     TOPICS,
     CommandSample,
     Lane,
+    ObjectsSample,
+    ParameterChange,
+    ParametersSample,
     PlanSample,
+    ProfileSample,
     Publisher,
     Sample,
     SceneSample,
@@ -87,8 +91,15 @@ def samples_at(t_s: float, t_ns: int, seq: int) -> list[Sample]:
         CommandSample(
             **stamp, state_seq=seq, status="OK", solver="casadi-c", steer_rad=sr_rad / 14.7, drive_norm=ar - br,
             solve_time_ms=5.2 + 9 * abs(yaw_rad) * 6 + 0.8 * math.sin(t_s * 31), step_time_ms=7.0, sqp_iterations=3,
-            primal_residual=1e-9, dual_residual=1e-6, lateral_error_m=error_m, speed_error_mps=-0.3 * abs(yaw_rad),
+            qp_iterations=5, work=7.0, primal_residual=1e-9, dual_residual=1e-6, lateral_error_m=error_m,
+            speed_error_mps=-0.3 * abs(yaw_rad), disturbance_mps2=0.12, parameters_version=2, objects=1, objects_rejected=0,
         ),
+        ProfileSample(**stamp, solver="casadi-c", cycles=5, time_us={"qp": 640.0, "hessian": 702.4}, calls={"qp": 1.6, "hessian": 1.6}),
+        ParametersSample(
+            **stamp, version=2, accepted_ns=t_ns, who="ann@desk", reverts=[],
+            changes=[ParameterChange(name="planner.safe_time_s", old=1.2, new=1.8)],
+        ),
+        ObjectsSample(**stamp, objects=[WorldObject(name="van", x_m=150.0, y_m=5.4, yaw_rad=0.0, length_m=4.8, width_m=1.9)]),
         PlanSample(
             **stamp, x_m=ahead_m, y_m=[c[0] + error_m * math.exp(-0.2 * k) for k, c in enumerate(courses)],
             yaw_rad=[c[1] for c in courses], vx_mps=[SPEED_MPS] * len(courses),
@@ -97,7 +108,7 @@ def samples_at(t_s: float, t_ns: int, seq: int) -> list[Sample]:
         ),
         WorldSample(
             **stamp, **motion, **robots, yaw_rate_radps=yaw_rate_radps, ax_mps2=0.0, ay_mps2=SPEED_MPS * yaw_rate_radps,
-            robots_engaged=True, objects=[WorldObject(name="van", x_m=150.0, y_m=5.4, yaw_rad=0.0, length_m=4.8, width_m=1.9)],
+            robots_engaged=True,
         ),
         SceneSample(
             **stamp, scenario="iso3888-1", stage="hil", car_length_m=4.358, car_width_m=1.823, car_front_m=2.01, steering_ratio=14.7,
@@ -108,7 +119,7 @@ def samples_at(t_s: float, t_ns: int, seq: int) -> list[Sample]:
     ]
 
 
-_EVERY_TICKS = {"state": 2, "status": 10, "command": 4, "plan": 4, "world": 1, "scene": 50}
+_EVERY_TICKS = {"state": 2, "status": 10, "command": 4, "plan": 4, "profile": 20, "parameters": 50, "world": 1, "scene": 50, "objects": 4}
 
 
 class Feeder:
@@ -146,7 +157,7 @@ class Feeder:
 
 
 def free_base_port() -> int:
-    """First of four free neighbouring ports, one per source."""
+    """First of the free neighbouring ports, one per source."""
     for first in range(20000, 30000, 7):
         with ExitStack() as stack:
             try:
@@ -155,7 +166,7 @@ def free_base_port() -> int:
             except OSError:
                 continue
             return first
-    raise OSError("no four neighbouring free ports")
+    raise OSError("no neighbouring free ports")
 
 
 def free_port() -> int:

@@ -72,3 +72,9 @@ def test_a_topic_is_lost_when_it_is_older_than_its_limit(topic: str, limit_ms: i
     board.accept(topic, encoded(topic, 0), 0)
     assert not board.is_lost(topic, limit_ms * MS)
     assert board.is_lost(topic, (limit_ms + 1) * MS)
+
+
+def test_what_comes_once_per_event_is_never_lost() -> None:
+    board = Board()
+    board.accept("parameters", encoded("parameters", 0), 0)
+    assert not board.is_lost("parameters", 10**15)

@@ -14,6 +14,7 @@ import pytest
 from aiohttp import ClientSession, ClientWebSocketResponse, WSServerHandshakeError
 from aiohttp.test_utils import TestServer
 
+from gateway.telemetry import TOPICS
 from tests.visualiser.feeder import Feeder, free_base_port, free_port, running
 from tests.visualiser.test_board import encoded
 from visualiser import bridge as bridge_module
@@ -183,11 +184,11 @@ def test_live_samples_reach_a_browser_and_the_view_ends_with_one_still_attached(
                 except OSError:
                     await asyncio.sleep(0.05)
             deadline = time.monotonic() + 20.0
-            while len(seen) < 6 and time.monotonic() < deadline:
+            while len(seen) < len(TOPICS) and time.monotonic() < deadline:
                 seen |= (await ask(link))["topics"]
             stop.set()
             assert (await link.receive(timeout=10.0)).data == 1001  # the bridge says that it goes away
-        assert set(seen) == {"state", "status", "command", "plan", "world", "scene"}
+        assert set(seen) == set(TOPICS)
         assert len(seen["plan"]["sample"]["x_m"]) == 31
 
     with running(threading.Thread(target=run, args=(options, stop)), stop), Feeder(base_port):

@@ -14,7 +14,7 @@ from visualiser.board import Board
 from visualiser.watch import WatchOptions, line, run, table
 
 MS = 1_000_000
-TOPICS = ("state", "status", "command", "plan", "world", "scene")
+TOPICS = ("state", "status", "command", "plan", "profile", "parameters", "world", "scene", "objects")
 
 
 def full_board(**status: object) -> Board:
@@ -42,6 +42,11 @@ def test_the_table_says_mode_motion_solver_counters_and_ages() -> None:
     assert row(text, "Speed").split()[1:] == ["80.0", "km/h"]
     assert "casadi-c" in row(text, "Solver")
     assert "of 40 ms" in row(text, "Solver")
+    assert "3 SQP, 5 QP iterations" in row(text, "Solver")
+    assert row(text, "Disturbance").split()[1:] == ["+0.12", "m/s²"]
+    assert row(text, "Objects").split()[1:] == ["1", "considered"]
+    assert row(text, "Parameters").split()[1:] == ["version", "2"]
+    assert row(text, "Profile").split()[1:] == ["qp", "640", "hessian", "702", "µs", "per", "cycle"]
     assert row(text, "Command   ").split() == ["Command", "OK"]
     assert "4 rejected" in row(text, "Frames")
     assert row(text, "Age plan").split() == ["Age", "plan", "20", "ms", "1", "samples"]
@@ -65,7 +70,7 @@ def test_the_line_says_the_same_in_short() -> None:
     assert text.startswith("ENGAGED  80.0 km/h x -15.56 m y ")
     assert "command OK solve " in text
     assert "lost" not in text
-    assert line(full_board(), 600 * MS).endswith("lost: state, status, command, plan, world")
+    assert line(full_board(), 600 * MS).endswith("lost: state, status, command, plan, profile, world, objects")
 
 
 def test_without_a_terminal_it_prints_lines(capsys: pytest.CaptureFixture[str]) -> None:

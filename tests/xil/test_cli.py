@@ -33,7 +33,7 @@ def test_unknown_bus(tmp_path, bus):
 
 
 def test_unknown_solver(tmp_path):
-    fails(2, "ipopt", "casadi-c", arguments=["drive", "--solver", "ipopt", "--out", str(tmp_path)])
+    fails(2, "magic", "casadi-c", arguments=["drive", "--solver", "magic", "--out", str(tmp_path)])
 
 
 def test_vehil_needs_a_real_bus(tmp_path):

@@ -6,6 +6,7 @@ import signal
 
 import pytest
 
+from controller.tuning import SetRequest, request
 from gateway.conditions import MAX_TICK_GAP_NS
 from gateway.telemetry import StateSample, Subscriber, decode
 from tests.support.processes import children, end, free_base_port, is_running, start_xilgate, wait_until
@@ -18,12 +19,13 @@ EVERYONE = {"bus", "gateway", "controller", "emulator"}
 class Drive:
     """A running `xilgate drive` and its newest state."""
 
-    def __init__(self, out):
-        port = free_base_port()
+    def __init__(self, out, scenario="iso3888-1"):
+        self.port = port = free_base_port()
         self.out = out
         self.state = None
         self._subscriber = Subscriber(self._receive, ["state"], port)
-        self.process = start_xilgate("drive", "--stage", "hil", "--bus", "emulated", "--out", str(out), "--telemetry-port", str(port))
+        arguments = ["--stage", "hil", "--bus", "emulated", "--out", str(out), "--telemetry-port", str(port)]
+        self.process = start_xilgate("drive", scenario, *arguments)
         self.children = {}
 
     def _receive(self, topic, payload):
@@ -85,7 +87,7 @@ def test_the_double_lane_change_passes(tmp_path):
     assert code == 0, output
     summary = json.loads((out / "summary.json").read_text())
     assert summary["verdict"] == "pass"
-    assert summary["solver"] == "casadi-c"
+    assert summary["solver"] == "riccati"
     assert {"controller library", "robots.dbc", "gnss_imu.dbc", "configuration"} <= summary["sha256"].keys()
     assert (out / "bus.log").read_text().count("\n") > 20_000
 
@@ -121,6 +123,25 @@ def test_no_process_survives_its_runner(drive, number):
     drive.process.communicate(timeout=20)
     assert drive.process.returncode == (-9 if number is signal.SIGKILL else 130)
     wait_until(drive.is_gone, 5, "the end of every process")
+
+
+def test_a_run_tells_the_controller_of_its_objects_and_keeps_what_was_tuned(tmp_path):
+    drive = Drive(tmp_path, "cut-in")
+    samples = {"objects": [], "command": []}
+    try:
+        with Subscriber(lambda topic, payload: samples[topic].append(decode(topic, payload)), list(samples), drive.port):
+            drive.wait_for(lambda state: state.mode == "ENGAGED", "the engagement")
+            request(SetRequest(changes={"planner.safe_time_s": 1.3}, who="a test"), drive.port)
+            drive.wait_for(lambda state: samples["command"][-1].objects == 1, "the object in the controller")
+            drive.wait_for(lambda state: samples["command"][-1].parameters_version == 1, "the parameter in force")
+        assert [thing.name for thing in samples["objects"][-1].objects] == ["slow car"]
+        assert samples["objects"][0].objects == []
+        assert [sample.seq for sample in samples["objects"]] == sorted({sample.seq for sample in samples["objects"]})
+        drive.process.send_signal(signal.SIGINT)
+        drive.process.communicate(timeout=20)
+        assert "parameters version 1 by a test: planner.safe_time_s 1.2 -> 1.3" in (tmp_path / "controller.log").read_text()
+    finally:
+        drive.close()
 
 
 def test_interrupting_a_real_car_stops_it_first(tmp_path):

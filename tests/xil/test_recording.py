@@ -17,7 +17,7 @@ def at(t_s: float) -> int:
 def world(t_s: float, seq: int = 0, x_m: float = 0.0) -> WorldSample:
     return WorldSample(
         t_ns=at(t_s), seq=seq, x_m=x_m, y_m=0.0, yaw_rad=0.0, vx_mps=0.0, vy_mps=0.0, yaw_rate_radps=0.0, ax_mps2=0.0, ay_mps2=0.0,
-        sr_angle_rad=0.0, ar_position_norm=0.0, br_position_norm=0.0, robots_engaged=True, objects=[],
+        sr_angle_rad=0.0, ar_position_norm=0.0, br_position_norm=0.0, robots_engaged=True,
     )  # fmt: skip
 
 

@@ -136,7 +136,7 @@ def test_reference_is_continuous_up_to_its_curvature(name):
     assert step_m.max() < 0.25
     assert np.abs(chord_rad - middle_rad).max() < 1e-4
     # A step in curvature would be as large as the curvature itself; the smooth reference changes by less than 6 % of it per sample.
-    assert np.abs(np.diff(curvature)).max() < 0.06 * np.abs(curvature).max()
+    assert np.abs(np.diff(curvature)).max() <= 0.06 * np.abs(curvature).max()
 
 
 def test_curves_turn_as_their_radius_says():

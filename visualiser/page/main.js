@@ -24,7 +24,7 @@ const link = new Link((topic, sample, arrivedMs) => {
   if (topic === "state") charts.pushState(sample, referenceKmh(sample));
   if (topic === "command") charts.pushCommand(sample);
   if (topic === "plan") world?.setPlan(sample);
-  if (topic === "world") world?.setObjects(sample.objects);
+  if (topic === "objects") world?.setObjects(sample.objects);
   if (topic === "scene") showScene(sample);
 });
 
@@ -58,6 +58,7 @@ function draw(now, dt) {
   const pose = poses[source].at(now);
   const sample = link.samples[source];
   if (pose) world.place(pose, link.isLost(source, now) ? 0 : sample.vx_mps, sample.sr_angle_rad, sample.br_position_norm, dt);
+  if (link.isLost("objects", now)) world.setObjects([]);
   if (!link.fresh("plan", now) && world.horizon.count > 0) world.setPlan(undefined);
   world.render(canvas.clientWidth, canvas.clientHeight, quality.pixelRatio);
   xilgate.stats.pose = pose;

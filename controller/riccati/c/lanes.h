@@ -29,8 +29,12 @@
 #if LANES == 1
 
 typedef double lanes;
+typedef int lane_bits;
 
 static inline lanes lanes_of(double x) { return x; }
+static inline lanes lanes_select(lane_bits mask, lanes when_true, lanes when_false) { return mask ? when_true : when_false; }
+static inline lanes lanes_abs(lanes x) { return fabs(x); }
+static inline double lanes_largest(lanes x) { return x; }
 static inline lanes lanes_sqrt(lanes x) { return sqrt(x); }
 static inline lanes lanes_atan(lanes x) { return atan(x); }
 static inline void lanes_sincos(lanes x, lanes *sine, lanes *cosine)
@@ -50,6 +54,15 @@ typedef int64_t lane_bits __attribute__((vector_size(8 * LANES)));
 static inline lanes lanes_select(lane_bits mask, lanes when_true, lanes when_false)
 {
     return (lanes)((mask & (lane_bits)when_true) | (~mask & (lane_bits)when_false));
+}
+
+static inline lanes lanes_abs(lanes x) { return (lanes)((lane_bits)x & INT64_MAX); }
+
+static inline double lanes_largest(lanes x)
+{
+    double largest = x[0];
+    for (int i = 1; i < LANES; i++) largest = x[i] > largest ? x[i] : largest;
+    return largest;
 }
 
 static inline lanes lanes_sqrt(lanes x)
@@ -101,7 +114,7 @@ static __attribute__((noinline, cold)) lanes lanes_atan_large(lanes x, lanes mag
 
 static inline lanes lanes_atan(lanes x)
 {
-    const lanes magnitude = (lanes)((lane_bits)x & INT64_MAX);
+    const lanes magnitude = lanes_abs(x);
     const lane_bits is_small = magnitude < 0.4375;
     int64_t all_small = -1;
     for (int i = 0; i < LANES; i++) all_small &= is_small[i];

@@ -2,7 +2,10 @@
  *
  *   sum over k < N of (x_k - r_k)' Q (x_k - r_k) + u_k' R u_k + (u_k - u_k-1)' S (u_k - u_k-1),  plus (x_N - r_N)' Q_N (x_N - r_N)
  */
+#include <string.h>
+
 #include "solver.h"
+#include "stage.h"
 #include "stage_functions.h"
 
 /* Numbers of LANES stages: values of the first component for all of them, then of the second, and so on. */
@@ -24,34 +27,34 @@ static void gather(const iterate *at, int first, stage_group *group)
     }
 }
 
-static int lanes_used(int first) { return N - first < LANES ? N - first : LANES; }
-
 static void scatter_gaps(const iterate *at, int first, const stage_group *group, linearization *model)
 {
-    for (int lane = 0; lane < lanes_used(first); lane++) {
-        for (int j = 0; j < NX; j++) model->gap[first + lane][j] = group->next[j][lane] - at->z[first + lane + 1][j];
+    for (int lane = 0; lane < LANES; lane++) {
+        const int k = first + lane < N ? first + lane : N - 1;
+        for (int j = 0; j < NX; j++) model->gap[first + lane][j] = group->next[j][lane] - at->z[k + 1][j];
     }
 }
 
 static void scatter_derivatives(int first, double jacobian[][LANES], double hessian[][LANES], linearization *model)
 {
-    for (int lane = 0; lane < lanes_used(first); lane++) {
-        double(*J)[NZ] = model->jacobian[first + lane], (*H)[NZ] = model->hessian[first + lane];
-        for (int i = 0; i < JACOBIAN_NONZEROS; i++) J[jacobian_row[i]][jacobian_column[i]] = jacobian[i][lane];
-        for (int i = 0; i < HESSIAN_NONZEROS; i++) {
-            H[hessian_row[i]][hessian_column[i]] = H[hessian_column[i]][hessian_row[i]] = hessian[i][lane];
+    double *J = model->jacobian[first][0], *H = model->hessian[first][0];
+    for (int i = 0; i < JACOBIAN_NONZEROS; i++) {
+        for (int lane = 0; lane < LANES; lane++) J[lane * NX * STAGE_ROOM + jacobian_place[i]] = jacobian[i][lane];
+    }
+    for (int i = 0; i < HESSIAN_NONZEROS; i++) {
+        for (int lane = 0; lane < LANES; lane++) {
+            double *of_stage = &H[lane * NZ * STAGE_ROOM];
+            of_stage[hessian_place[i]] = of_stage[hessian_mirrored_place[i]] = hessian[i][lane];
         }
     }
 }
 
-static void multiply_adjoint(const iterate *at, linearization *model)
+/* gap_multiplier' times the Jacobian of a stage. */
+static stage_vector adjoint_product(const iterate *at, const linearization *model, int k)
 {
-    for (int k = 0; k < N; k++) {
-        for (int j = 0; j < NZ; j++) model->adjoint[k][j] = 0.0;
-        for (int i = 0; i < NX; i++) {
-            for (int j = 0; j < NZ; j++) model->adjoint[k][j] += model->jacobian[k][i][j] * at->gap_multiplier[k + 1][i];
-        }
-    }
+    stage_vector sum = scaled(at->gap_multiplier[k + 1][0], model->jacobian[k][0]);
+    for (int i = 1; i < NX; i++) sum = plus(sum, at->gap_multiplier[k + 1][i], model->jacobian[k][i]);
+    return sum;
 }
 
 static void cost_gradient(const problem_data *p, const iterate *at, linearization *model)
@@ -82,7 +85,7 @@ void linearize(const problem_data *problem, const iterate *at, linearization *mo
         scatter_gaps(at, first, &group, model);
         scatter_derivatives(first, jacobian, hessian, model);
     }
-    multiply_adjoint(at, model);
+    for (int k = 0; k < N; k++) store(model->adjoint[k], adjoint_product(at, model, k));
     cost_gradient(problem, at, model);
     row_values(problem, at, model->row_value);
 }
@@ -96,10 +99,20 @@ void linearize_gradient(const problem_data *problem, const iterate *at, lineariz
         gather(at, first, &group);
         stage_adjoint(AS_LANES(group.z), AS_LANES(group.multiplier), AS_LANES(group.next), AS_LANES(adjoint));
         scatter_gaps(at, first, &group, model);
-        for (int lane = 0; lane < lanes_used(first); lane++) {
+        for (int lane = 0; lane < LANES; lane++) {
             for (int j = 0; j < NZ; j++) model->adjoint[first + lane][j] = adjoint[j][lane];
         }
     }
     cost_gradient(problem, at, model);
     row_values(problem, at, model->row_value);
+}
+
+/* Put the gradient right for the use of a Jacobian of another iterate, after `linearize_gradient`. */
+void correct_gradient(const iterate *at, linearization *model)
+{
+    for (int k = 0; k < N; k++) {
+        stage_row product;
+        store(product, adjoint_product(at, model, k));
+        for (int j = 0; j < NZ; j++) model->gradient[k][j] += model->adjoint[k][j] - product[j];
+    }
 }

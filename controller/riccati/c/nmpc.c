@@ -6,7 +6,7 @@
 
 #include "lanes.h"
 #include "solver.h"
-#include "stage_functions.h"
+#include "stage.h"
 
 size_t nmpc_solver_bytes(void) { return sizeof(nmpc_solver); }
 size_t nmpc_solver_alignment(void) { return _Alignof(nmpc_solver); }
@@ -33,72 +33,65 @@ static void load_parameters(const double *parameters, problem_data *p)
     read(p->difference_weight, rest, NU);
 }
 
-/* Row i is variable `variable`, or row `constraint` of g, whichever is not negative; row_places lists both for all rows. */
-static void row_places(int variable[ROWS], int constraint[ROWS])
+/* What vectors shaped as w and as g have for each row; `none` for a row without a place in them. */
+static void rows_of(const double *w, const double *g, double none, row_array rows)
 {
+    const double *corridor = &g[N * NX - 1]; /* [k]: of node k */
     for (int k = 0; k < N; k++) {
-        for (int j = 0; j < STAGE_BOUNDS; j++) {
-            variable[k * STAGE_ROWS + j] = k == 0 && j >= NU ? -1 : k * NZ + BOUNDED_COMPONENT[j];
-            constraint[k * STAGE_ROWS + j] = -1;
-        }
-        variable[k * STAGE_ROWS + STAGE_BOUNDS] = -1;
-        constraint[k * STAGE_ROWS + STAGE_BOUNDS] = k == 0 ? -1 : N * NX + k - 1;
+        double *of_stage = &rows[k * STAGE_ROWS];
+        for (int i = 0; i < STAGE_BOUNDS; i++) of_stage[i] = k > 0 || i < NU ? w[k * NZ + BOUNDED_COMPONENT[i]] : none;
+        of_stage[STAGE_BOUNDS] = k > 0 ? corridor[k] : none;
     }
-    for (int j = 0; j < NX; j++) {
-        variable[LAST_ROW + j] = N * NZ + j;
-        constraint[LAST_ROW + j] = -1;
-    }
-    variable[LAST_ROW + NX] = -1;
-    constraint[LAST_ROW + NX] = N * NX + N - 1;
+    memcpy(&rows[LAST_ROW], &w[N * NZ], NX * sizeof *w);
+    rows[LAST_ROW + NX] = corridor[N];
+    for (int i = ROWS; i < ROW_ROOM; i++) rows[i] = none;
 }
 
-static bool is_hard(int row) { return row < LAST_ROW && row % STAGE_ROWS < NU; }
+/* The other way; places in the vectors that belong to no row stay as they are. */
+static void put_rows(const row_array rows, double *w, double *g)
+{
+    double *corridor = &g[N * NX - 1];
+    for (int k = 0; k < N; k++) {
+        const double *of_stage = &rows[k * STAGE_ROWS];
+        for (int i = 0; i < (k > 0 ? STAGE_BOUNDS : NU); i++) w[k * NZ + BOUNDED_COMPONENT[i]] = of_stage[i];
+        if (k > 0) corridor[k] = of_stage[STAGE_BOUNDS];
+    }
+    memcpy(&w[N * NZ], &rows[LAST_ROW], NX * sizeof *w);
+    corridor[N] = rows[LAST_ROW + NX];
+}
 
 static void load_rows(const nmpc_problem *from, problem_data *p, iterate *guess)
 {
-    int variable[ROWS], constraint[ROWS];
-    row_places(variable, constraint);
-    for (int i = 0; i < ROWS; i++) {
-        const int v = variable[i], c = constraint[i];
-        p->lower[i] = v >= 0 ? from->w_lower[v] : c >= 0 ? from->g_lower[c] : -INFINITY;
-        p->upper[i] = v >= 0 ? from->w_upper[v] : c >= 0 ? from->g_upper[c] : INFINITY;
-        const double multiplier = v >= 0 ? from->lam_w_guess[v] : c >= 0 ? from->lam_g_guess[c] : 0.0;
-        const double bound = multiplier > 0.0 ? p->upper[i] : p->lower[i];
-        guess->row_multiplier[i] = isfinite(bound) ? multiplier : 0.0;
-        p->penalty_linear[i] = is_hard(i) ? INFINITY : from->penalty_linear;
-        p->penalty_quadratic[i] = is_hard(i) ? 0.0 : from->penalty_quadratic;
+    rows_of(from->w_lower, from->g_lower, -INFINITY, p->lower);
+    rows_of(from->w_upper, from->g_upper, INFINITY, p->upper);
+    rows_of(from->lam_w_guess, from->lam_g_guess, 0.0, guess->row_multiplier);
+    for (int i = 0; i < ROW_ROOM; i++) {
+        const double bound = guess->row_multiplier[i] > 0.0 ? p->upper[i] : p->lower[i];
+        if (!isfinite(bound)) guess->row_multiplier[i] = 0.0;
+        p->penalty_linear[i] = from->penalty_linear;
     }
+    for (int k = 0; k < N; k++) {
+        for (int j = 0; j < NU; j++) p->penalty_linear[k * STAGE_ROWS + j] = INFINITY;
+    }
+    p->penalty_quadratic = from->penalty_quadratic;
 }
 
 static void load_point(const double *w, const double *lam_g, iterate *point)
 {
-    memset(point, 0, sizeof *point);
     memcpy(point->z, w, NMPC_VARIABLES * sizeof *w);
+    memset(&point->z[N][NX], 0, NU * sizeof *w);
+    memset(point->gap_multiplier[0], 0, NX * sizeof *lam_g);
     memcpy(point->gap_multiplier[1], lam_g, N * NX * sizeof *lam_g);
+    memset(point->state_multiplier, 0, sizeof point->state_multiplier);
 }
 
-static void clip_inputs(const problem_data *p, iterate *point)
+static void store_answer(const iterate *answer, double *w, double *lam_w, double *lam_g)
 {
-    for (int k = 0; k < N; k++) {
-        for (int j = 0; j < NU; j++) {
-            const int row = k * STAGE_ROWS + j;
-            point->z[k][NX + j] = fmin(fmax(point->z[k][NX + j], p->lower[row]), p->upper[row]);
-        }
-    }
-}
-
-static void store(const nmpc_solver *s, double *w, double *lam_w, double *lam_g)
-{
-    int variable[ROWS], constraint[ROWS];
-    row_places(variable, constraint);
-    memcpy(w, s->last_finite.z, NMPC_VARIABLES * sizeof *w);
-    memcpy(lam_g, s->last_finite.gap_multiplier[1], N * NX * sizeof *lam_g);
+    memcpy(w, answer->z, NMPC_VARIABLES * sizeof *w);
+    memcpy(lam_g, answer->gap_multiplier[1], N * NX * sizeof *lam_g);
     memset(lam_w, 0, NMPC_VARIABLES * sizeof *lam_w);
-    memcpy(lam_w, s->last_finite.state_multiplier, sizeof s->last_finite.state_multiplier);
-    for (int i = 0; i < ROWS; i++) {
-        if (variable[i] >= 0) lam_w[variable[i]] = s->last_finite.row_multiplier[i];
-        if (constraint[i] >= 0) lam_g[constraint[i]] = s->last_finite.row_multiplier[i];
-    }
+    memcpy(lam_w, answer->state_multiplier, sizeof answer->state_multiplier);
+    put_rows(answer->row_multiplier, lam_w, lam_g);
 }
 
 nmpc_statistics nmpc_solve(nmpc_solver *s, const nmpc_problem *problem, double *w, double *lam_w, double *lam_g)
@@ -109,34 +102,42 @@ nmpc_statistics nmpc_solve(nmpc_solver *s, const nmpc_problem *problem, double *
     load_rows(problem, &s->problem, &s->current);
     clip_inputs(&s->problem, &s->current);
     sqp(s);
-    store(s, w, lam_w, lam_g);
+    store_answer(&s->last_finite, w, lam_w, lam_g);
     return s->statistics;
 }
 
 void nmpc_evaluate(nmpc_solver *s, const double *parameters, const double *w, const double *lam_g, double *g, double *gradient)
 {
-    double by_stage[N + 1][NZ], rows[ROWS] = {0};
-    int variable[ROWS], constraint[ROWS];
-    row_places(variable, constraint);
+    double by_stage[N + 1][NZ];
+    row_array multiplier = {0};
+    memset(&s->model, 0, sizeof s->model);
     load_parameters(parameters, &s->problem);
     load_point(w, lam_g, &s->current);
     linearize_gradient(&s->problem, &s->current, &s->model);
     memcpy(g, s->model.gap, N * NX * sizeof *g);
-    for (int i = 0; i < ROWS; i++) {
-        if (constraint[i] < 0) continue;
-        g[constraint[i]] = s->model.row_value[i];
-        rows[i] = lam_g[constraint[i]];
-    }
     lagrangian_gradient(&s->problem, &s->current, &s->model, by_stage);
-    for (int k = 1; k <= N; k++) add_row_gradients(&s->problem, k, rows, by_stage[k]);
+    for (int k = 1; k <= N; k++) {
+        g[N * NX + k - 1] = s->model.row_value[corridor_row(k)];
+        multiplier[corridor_row(k)] = lam_g[N * NX + k - 1];
+        add_row_gradients(&s->problem, k, multiplier, by_stage[k]);
+    }
     memcpy(gradient, by_stage, NMPC_VARIABLES * sizeof *gradient);
 }
 
 void nmpc_advance(const double *x, const double *u, double duration_s, double *x_after)
 {
-    lanes x_lanes[NX], u_lanes[NU], duration = lanes_of(duration_s), after[NX];
+    lanes x_lanes[NX], u_lanes[NU], after[NX];
     for (int j = 0; j < NX; j++) x_lanes[j] = lanes_of(x[j]);
     for (int j = 0; j < NU; j++) u_lanes[j] = lanes_of(u[j]);
-    advance(x_lanes, u_lanes, &duration, after);
+    stage_advance(x_lanes, u_lanes, lanes_of(duration_s), after);
     for (int j = 0; j < NX; j++) x_after[j] = ((const double *)after)[j * LANES];
+}
+
+void nmpc_run_stage_sweep(nmpc_solver *s) { linearize(&s->problem, &s->current, &s->model); }
+void nmpc_run_adjoint_sweep(nmpc_solver *s) { linearize_gradient(&s->problem, &s->current, &s->model); }
+
+void nmpc_run_riccati(nmpc_solver *s)
+{
+    riccati_factorize(&s->problem, &s->model, N, &s->kkt);
+    riccati_solve(&s->problem, &s->current, &s->model, N, &s->kkt);
 }

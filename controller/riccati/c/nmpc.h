@@ -1,8 +1,8 @@
 /* Nonlinear model predictive control of a car: one optimal control problem solved per call.
  *
- * Stage vector z_k = (v_x, v_y [m/s], omega [rad/s], X, Y [m], psi [rad], delta [rad], t_r [-1 to 1]), k = 0 to N-1; the last stage N
- * has no input. Decision variables w = (z_0, ..., z_N-1, x_N). Constraints g: the gaps F(x_k, u_k) - x_k+1, then for the nodes 1 to N
- * the distance from the reference position to the left of the path [m].
+ * Stage vector z_k = (x_k, u_k), k = 0 to N-1, with the states and inputs that are named beside N_STATES and N_INPUTS, in SI units;
+ * the last stage N has no input. Decision variables w = (z_0, ..., z_N-1, x_N). Constraints g: the gaps F(x_k, u_k) - x_k+1, then for
+ * the nodes 1 to N the distance from the reference position to the left of the path [m].
  *
  * Bounds on inputs are hard. Bounds on states, the terminal box and the corridor are soft: a violation s costs
  * penalty_linear s + penalty_quadratic s^2 / 2, which is exact: while a multiplier is below penalty_linear, nothing is violated.
@@ -13,6 +13,7 @@
 #pragma once
 
 #include <stddef.h>
+#include <stdint.h>
 
 #include "problem_size.h"
 
@@ -36,7 +37,8 @@ typedef struct {
     const double *lam_w_guess;     /* [NMPC_VARIABLES] multipliers of the bounds, positive at the upper one */
     const double *lam_g_guess;     /* [NMPC_CONSTRAINTS] multipliers of the constraints */
     const double *parameters;      /* [NMPC_PARAMETERS] */
-    const double *w_lower, *w_upper; /* [NMPC_VARIABLES]; infinite where there is no bound, not read for x_0 */
+    const double *w_lower, *w_upper; /* [NMPC_VARIABLES]; infinite where there is no bound. Read for the inputs, for the bounded states
+                                      * of the model at the nodes 1 to N-1, and for all states of the last */
     const double *g_lower, *g_upper; /* [NMPC_CONSTRAINTS]; read for the corridor alone */
     double penalty_linear;         /* above 0 */
     double penalty_quadratic;      /* above 0 */
@@ -48,6 +50,12 @@ typedef enum {
     NMPC_NUMERICAL = 2,  /* no descent or no finite number from there on; the answer is the last finite iterate, or else the guess */
 } nmpc_status;
 
+/* Share of one part in a solve. The times are zero where the library was built with -DNMPC_NOW=0, for a target without a clock. */
+typedef struct {
+    int64_t time_ns;
+    int calls;
+} nmpc_part;
+
 typedef struct {
     nmpc_status status;
     int sqp_iterations;
@@ -55,6 +63,9 @@ typedef struct {
     int factorizations;
     double work;           /* in Riccati factorizations; bounded, see sqp.c */
     double primal_residual, dual_residual;
+    nmpc_part stage_sweep;   /* dynamics, Jacobian and Hessian of all stages, cost, constraints, residuals */
+    nmpc_part adjoint_sweep; /* the same without Jacobian and Hessian: gradient alone */
+    nmpc_part qp;            /* quadratic programmes, with their factorizations */
 } nmpc_statistics;
 
 NMPC_EXPORT size_t nmpc_solver_bytes(void);
@@ -75,6 +86,12 @@ NMPC_EXPORT void nmpc_evaluate(nmpc_solver *solver, const double *parameters, co
 
 /* State x_after [N_STATES] of the model, duration_s of constant input u [N_INPUTS] after state x [N_STATES]. */
 NMPC_EXPORT void nmpc_advance(const double *x, const double *u, double duration_s, double *x_after);
+
+/* Parts of a solve alone, to measure how far a whole one is from the least that it can take: one sweep with derivatives, one without
+ * Jacobian and Hessian, one Riccati factorization with one solution, each on what the last nmpc_solve left behind. */
+NMPC_EXPORT void nmpc_run_stage_sweep(nmpc_solver *solver);
+NMPC_EXPORT void nmpc_run_adjoint_sweep(nmpc_solver *solver);
+NMPC_EXPORT void nmpc_run_riccati(nmpc_solver *solver);
 
 #ifdef __cplusplus
 }

@@ -34,7 +34,7 @@ static bool row_residual(const problem_data *p, int i, double value, double mult
     const bool is_upper = multiplier > 0.0 || (multiplier == 0.0 && value > p->upper[i]);
     const double beyond = is_upper ? value - p->upper[i] : p->lower[i] - value;
     const double beyond_other = is_upper ? p->lower[i] - value : value - p->upper[i];
-    const double size = fabs(multiplier), linear = p->penalty_linear[i], quadratic = p->penalty_quadratic[i];
+    const double size = fabs(multiplier), linear = p->penalty_linear[i], quadratic = p->penalty_quadratic;
     const double along_value = size <= linear ? fabs(beyond) : fabs(beyond - (size - linear) / quadratic);
     const double inside = p->lower[i] < p->upper[i] ? size : INFINITY; /* an equality has no inside, where its multiplier is zero */
     const double along_multiplier = beyond <= 0.0 ? inside : fabs(size - linear - quadratic * beyond);
@@ -57,6 +57,10 @@ bool residuals(const problem_data *p, iterate *at, const linearization *model, d
         add_row_gradients(p, k, at->row_multiplier, gradient[k]);
         for (int j = k > 0 ? 0 : NX; j < NZ; j++) is_finite &= accumulate(dual, fabs(gradient[k][j]));
     }
-    for (int i = 0; i < ROWS; i++) is_finite &= row_residual(p, i, model->row_value[i], at->row_multiplier[i], primal, dual);
+    for (int i = 0; i < ROWS; i++) {
+        const double value = model->row_value[i], multiplier = at->row_multiplier[i];
+        if (multiplier == 0.0 && value >= p->lower[i] && value <= p->upper[i]) continue;
+        is_finite &= row_residual(p, i, value, multiplier, primal, dual);
+    }
     return is_finite;
 }

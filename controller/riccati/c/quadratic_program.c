@@ -11,13 +11,21 @@
  * cycle. When the pieces foretold m and the step was full, the minimum is found, and e := m; when e stays, the programme is solved.
  * (Bertsekas, Constrained Optimization and Lagrange Multiplier Methods, chapters 2 and 5; Qi and Sun, A nonsmooth version of
  * Newton's method, 1993.)
+ *
+ * On one set of pieces e := m is a linear fixed-point iteration, slow where a combination of active rows is nearly out of reach of the
+ * inputs. So two of them are extrapolated to where the correction m - e is smallest (Anderson, Iterative procedures for nonlinear
+ * integral equations, 1965, with depth one), and when that does not help, the weight grows (Bertsekas, chapter 2).
  */
 #include <math.h>
 #include <string.h>
 
+#include "lanes.h"
 #include "solver.h"
 
-#define WEIGHT 1e5             /* lower ones need more estimates, higher ones gain nothing */
+#define FIRST_WEIGHT 1e5       /* lower ones need more estimates, higher ones more Newton steps */
+#define LARGEST_WEIGHT 1e7     /* beyond, rounding shows in the multipliers */
+#define WEIGHT_GROWTH 10.0
+#define GOOD_DECREASE 0.25     /* of the violation with one estimate; with less the weight grows */
 #define ACTIVE_MULTIPLIER 1e-7 /* multipliers of the warm start below this are zero */
 #define SAME_MULTIPLIER 1e-6   /* a hundredth of the dual tolerance */
 #define LARGEST_VIOLATION 1e-8 /* a hundredth of the primal tolerance */
@@ -25,63 +33,142 @@
 #define MAX_FACTORIZATIONS 30
 #define MAX_SOLUTIONS 90
 #define SHARE_STEP 0.25        /* of the exact Hessian, given up when a pivot has no descent */
+#define LARGEST_EXTRAPOLATION 1e3
 
 #define LINE_SEARCH_START 0.1  /* search only when the slope at the full step is positive and above this part of that at zero */
 #define LINE_SEARCH_END 0.05
 #define LINE_SEARCH_STEPS 12
 #define SMALLEST_FRACTION 1e-4
+#define NO_SLOPE 1e-12
 
-/* m(c) of a row, and its slope. */
-static double penalty_multiplier(const problem_data *p, int i, double estimate, double value, double *slope)
+static double larger(double a, double b) { return a > b ? a : b; }
+
+/* How m grows with zeta where the violation pays. */
+static double paying_share(const problem_data *p, const active_set *qp)
 {
-    const double from_upper = estimate + WEIGHT * (value - p->upper[i]), from_lower = estimate + WEIGHT * (value - p->lower[i]);
+    return p->penalty_quadratic / (qp->weight + p->penalty_quadratic);
+}
+
+/* m of row i at a value. */
+static double multiplier_at(const problem_data *p, const active_set *qp, int i, double value)
+{
+    const double from_upper = qp->estimate[i] + qp->weight * (value - p->upper[i]);
+    const double from_lower = qp->estimate[i] + qp->weight * (value - p->lower[i]);
     const double zeta = from_upper > 0.0 ? from_upper : from_lower < 0.0 ? from_lower : 0.0;
     const double excess = fabs(zeta) - p->penalty_linear[i];
-    if (excess > 0.0) {
-        const double share = p->penalty_quadratic[i] / (WEIGHT + p->penalty_quadratic[i]);
-        *slope = WEIGHT * share;
-        return zeta - copysign((1.0 - share) * excess, zeta);
+    return excess > 0.0 ? zeta - copysign((1.0 - paying_share(p, qp)) * excess, zeta) : zeta;
+}
+
+#define AT(array, i) (*(lanes *)&(array)[i])
+#define FROM(array, i) (*(const lanes *)&(array)[i])
+
+/* Multipliers of all rows at their values, and the pieces of m that they lie on. */
+static void find_pieces(const problem_data *p, const row_array row_value, active_set *qp)
+{
+    const double share = paying_share(p, qp), w = qp->weight;
+    const lanes zero = lanes_of(0.0), weight = lanes_of(w), paying_weight = lanes_of(w * share);
+    for (int i = 0; i < ROW_ROOM; i += LANES) {
+        const lanes e = AT(qp->estimate, i), value = AT(qp->value, i), lower = FROM(p->lower, i), upper = FROM(p->upper, i);
+        const lanes from_upper = e + w * (value - upper), from_lower = e + w * (value - lower);
+        const lane_bits is_upper = from_upper > 0.0, is_active = is_upper | (from_lower < 0.0);
+        const lanes bound = lanes_select(is_upper, upper, lower), zeta = lanes_select(is_upper, from_upper, from_lower);
+        const lanes zeta_there = e + w * (FROM(row_value, i) - bound);
+        const lanes linear = FROM(p->penalty_linear, i), limit = lanes_select(is_upper, linear, -linear);
+        const lane_bits pays = lanes_abs(zeta) > linear;
+        const lanes multiplier = lanes_select(pays, limit + share * (zeta - limit), zeta);
+        const lanes intercept = lanes_select(pays, limit + share * (zeta_there - limit), zeta_there);
+        AT(qp->multiplier, i) = lanes_select(is_active, multiplier, zero);
+        AT(qp->intercept, i) = lanes_select(is_active, intercept, zero);
+        AT(qp->slope, i) = lanes_select(is_active, lanes_select(pays, paying_weight, weight), zero);
     }
-    *slope = zeta != 0.0 ? WEIGHT : 0.0;
-    return zeta;
 }
 
 /* Pieces from the multipliers of the iterate: active rows stand on their bound, or as far beyond it as their multiplier says. */
-static void start(const problem_data *p, const iterate *at, const linearization *model, active_set *qp)
+static void start(const problem_data *p, const iterate *at, const row_array row_value, active_set *qp)
 {
-    memset(qp->step, 0, sizeof qp->step);
-    for (int i = 0; i < ROWS; i++) {
-        const double multiplier = at->row_multiplier[i], excess = fabs(multiplier) - p->penalty_linear[i];
-        if (fabs(multiplier) <= ACTIVE_MULTIPLIER) {
-            qp->row_target[i] = model->row_value[i];
-            qp->estimate[i] = qp->multiplier[i] = qp->slope[i] = 0.0;
-            continue;
-        }
-        const double beyond = excess > 0.0 ? copysign(excess / p->penalty_quadratic[i], multiplier) : 0.0;
-        qp->row_target[i] = (multiplier > 0.0 ? p->upper[i] : p->lower[i]) + beyond;
-        qp->estimate[i] = multiplier;
-        qp->multiplier[i] = penalty_multiplier(p, i, multiplier, qp->row_target[i], &qp->slope[i]);
+    const lanes zero = lanes_of(0.0);
+    for (int i = 0; i < ROW_ROOM; i += LANES) {
+        const lanes multiplier = FROM(at->row_multiplier, i), lower = FROM(p->lower, i), upper = FROM(p->upper, i);
+        const lanes excess = lanes_abs(multiplier) - FROM(p->penalty_linear, i), value = FROM(row_value, i);
+        const lanes violation = lanes_select(excess > 0.0, excess * (1.0 / p->penalty_quadratic), zero);
+        const lanes inside = lanes_select(value > upper, upper, lanes_select(value < lower, lower, value));
+        const lanes beyond = lanes_select(multiplier > 0.0, upper + violation, lower - violation);
+        const lane_bits is_active = lanes_abs(multiplier) > ACTIVE_MULTIPLIER;
+        AT(qp->estimate, i) = lanes_select(is_active, multiplier, zero);
+        AT(qp->value, i) = lanes_select(is_active, beyond, inside);
+        AT(qp->last_multiplier, i) = AT(qp->last_correction, i) = zero;
     }
+    find_pieces(p, row_value, qp);
+    qp->violation = INFINITY;
+    qp->has_last = false;
 }
 
-/* With as much of the exact Hessian as has a descent at every pivot; false when even Gauss-Newton has none. */
-static bool factorize(nmpc_solver *s)
+/* Last stage at which two arrays of rows differ; -1 when they are the same. */
+static int last_difference(const row_array a, const row_array b)
 {
+    int i = ROWS - 1;
+    while (i >= 0 && a[i] == b[i]) i--;
+    return i < 0 ? -1 : stage_of_row(i);
+}
+
+/* With as much of the exact Hessian as has a descent at every pivot; false when even Gauss-Newton has none. Stages above `last` are
+ * as they were; returns in `last` from where they are new. */
+static bool factorize(nmpc_solver *s, int *last)
+{
+    memcpy(s->kkt.row_weight, s->qp.slope, sizeof s->kkt.row_weight);
     for (;;) {
         s->statistics.factorizations++;
-        s->statistics.work += WORK_FACTORIZATION;
-        if (riccati_factorize(&s->problem, &s->model, &s->kkt)) return true;
+        s->statistics.work += WORK_FACTORIZATION * (*last + 1) / (N + 1);
+        if (riccati_factorize(&s->problem, &s->model, *last, &s->kkt)) return true;
         if (s->kkt.exact_share <= 0.0) return false;
         s->kkt.exact_share -= SHARE_STEP;
+        *last = N;
     }
 }
 
-/* d' H d of the quadratic programme without its rows, for d from the point reached to the new solution. */
+/* The minimum on the present pieces into s->kkt; the change of the rows' values towards it, and those values. False when no Hessian
+ * has a descent. With `is_new` nothing of the factorization and the solution before is of use, with `is_new_solution` that alone. */
+static bool newton_point(nmpc_solver *s, bool is_new_factor, bool is_new_solution)
+{
+    active_set *qp = &s->qp;
+    riccati *kkt = &s->kkt;
+    int last = is_new_factor ? N : last_difference(qp->slope, kkt->row_weight);
+    if (last >= 0 && !factorize(s, &last)) return false;
+    const int last_gradient = is_new_solution ? N : last_difference(qp->intercept, kkt->row_gradient);
+    if (last_gradient > last) last = last_gradient;
+    memcpy(kkt->row_gradient, qp->intercept, sizeof kkt->row_gradient);
+    riccati_solve(&s->problem, &s->current, &s->model, last, kkt);
+    s->statistics.qp_iterations++;
+    s->statistics.work += WORK_SOLUTION;
+    row_array product;
+    row_products(&s->problem, kkt->step, product);
+    for (int i = 0; i < ROW_ROOM; i++) {
+        const double value = s->model.row_value[i] + product[i];
+        qp->change[i] = value - qp->value[i];
+        qp->value[i] = value;
+    }
+    return true;
+}
+
+/* Rows that have a multiplier at the value reached, an estimate of one, or were foretold one; and what was foretold. */
+static void find_engaged(const riccati *kkt, const row_array row_value, active_set *qp)
+{
+    qp->n_engaged = 0;
+    for (int first = 0; first < ROW_ROOM; first += LANES) {
+        const lanes weight = FROM(kkt->row_weight, first);
+        const lanes is_idle = lanes_abs(AT(qp->multiplier, first)) + lanes_abs(AT(qp->estimate, first)) + weight;
+        if (lanes_largest(is_idle) == 0.0) continue;
+        AT(qp->foretold, first) = FROM(kkt->row_gradient, first) + weight * (AT(qp->value, first) - FROM(row_value, first));
+        for (int i = first; i < first + LANES; i++) qp->engaged[qp->n_engaged++] = i;
+    }
+}
+
+/* d' H d of the quadratic programme without its rows, for d from the point reached before to the new one. */
 static double curvature_along(const problem_data *p, const linearization *model, const riccati *kkt, const active_set *qp)
 {
     double sum = 0.0, previous[NU] = {0};
     for (int k = 0; k <= N; k++) {
-        double d[NZ];
+        double d[NZ], product[NZ] = {0};
         for (int j = 0; j < NZ; j++) d[j] = kkt->step[k][j] - qp->step[k][j];
         const double *weight = k < N ? p->weight : p->last_weight;
         for (int j = 0; j < (k < N ? NZ : NX); j++) sum += 2.0 * weight[j] * d[j] * d[j];
@@ -92,43 +179,40 @@ static double curvature_along(const problem_data *p, const linearization *model,
             previous[j] = d[NX + j];
         }
         for (int i = 0; i < NZ; i++) {
-            double product = 0.0;
-            for (int j = 0; j < NZ; j++) product += model->hessian[k][i][j] * d[j];
-            sum += kkt->exact_share * product * d[i];
+            for (int j = 0; j < NZ; j++) product[j] += model->hessian[k][i][j] * d[i];
         }
+        for (int j = 0; j < NZ; j++) sum += kkt->exact_share * product[j] * d[j];
     }
     return sum;
 }
 
-/* Sum of m(c) times the change of c along the line, at a fraction of it. */
-static double row_slope_along(const problem_data *p, const active_set *qp, double fraction)
+/* Derivative of the augmented Lagrangian along the way to the Newton point, at a fraction of it. It would vanish at 1, were m what was
+ * foretold; `curvature` is that of the rest. */
+static double derivative_along(const problem_data *p, const active_set *qp, double curvature, double fraction)
 {
-    double sum = 0.0, slope;
-    for (int i = 0; i < ROWS; i++) {
-        const double value = qp->row_target[i] + fraction * qp->row_change[i];
-        sum += penalty_multiplier(p, i, qp->estimate[i], value, &slope) * qp->row_change[i];
+    double sum = (fraction - 1.0) * curvature;
+    for (int n = 0; n < qp->n_engaged; n++) {
+        const int i = qp->engaged[n];
+        const double value = qp->value[i] - (1.0 - fraction) * qp->change[i];
+        sum += (multiplier_at(p, qp, i, value) - qp->foretold[i]) * qp->change[i];
     }
     return sum;
 }
 
-/* Fraction of the way to the Newton point at which the augmented Lagrangian is smallest; its derivative along the way is
- * constant + fraction * curvature + row_slope_along(fraction), and would vanish at 1 if the pieces stayed the same. */
+/* Fraction of the way to the Newton point at which the augmented Lagrangian is smallest. */
 static double exact_line_search(const nmpc_solver *s)
 {
     const active_set *qp = &s->qp;
+    double at_high = derivative_along(&s->problem, qp, 0.0, 1.0);
+    if (at_high <= NO_SLOPE) return 1.0;
     const double curvature = curvature_along(&s->problem, &s->model, &s->kkt, qp);
-    double constant = -curvature;
-    for (int i = 0; i < ROWS; i++) constant -= (qp->multiplier[i] + qp->slope[i] * qp->row_change[i]) * qp->row_change[i];
-    double low = 0.0, high = 1.0;
-    double at_low = constant + row_slope_along(&s->problem, qp, low);
-    double at_high = constant + curvature + row_slope_along(&s->problem, qp, high);
+    double at_low = derivative_along(&s->problem, qp, curvature, 0.0), low = 0.0, high = 1.0, fraction = 1.0;
     const double scale = fabs(at_low);
-    if (at_high <= LINE_SEARCH_START * scale + 1e-12 || at_low >= 0.0) return 1.0;
-    double fraction = high;
+    if (at_high <= LINE_SEARCH_START * scale || at_low >= 0.0) return 1.0;
     for (int i = 0; i < LINE_SEARCH_STEPS; i++) {
         const bool is_bisection = i > 1 && i % 2 == 1;
         fraction = is_bisection ? 0.5 * (low + high) : (low * at_high - high * at_low) / (at_high - at_low);
-        const double slope = constant + fraction * curvature + row_slope_along(&s->problem, qp, fraction);
+        const double slope = derivative_along(&s->problem, qp, curvature, fraction);
         if (fabs(slope) < LINE_SEARCH_END * scale) break;
         if (slope > 0.0) {
             high = fraction;
@@ -141,25 +225,26 @@ static double exact_line_search(const nmpc_solver *s)
     return fmax(fraction, SMALLEST_FRACTION);
 }
 
+/* Go a fraction of the way. */
 static void move(const nmpc_solver *s, double fraction, active_set *qp)
 {
+    if (fraction == 1.0) {
+        memcpy(qp->step, s->kkt.step, sizeof qp->step);
+        return;
+    }
     for (int k = 0; k <= N; k++) {
-        for (int j = 0; j < NZ; j++) qp->step[k][j] = (1.0 - fraction) * qp->step[k][j] + fraction * s->kkt.step[k][j];
+        for (int j = 0; j < NZ; j++) qp->step[k][j] += fraction * (s->kkt.step[k][j] - qp->step[k][j]);
     }
-    for (int i = 0; i < ROWS; i++) {
-        const double change = fraction * qp->row_change[i];
-        qp->row_target[i] += change;
-        qp->predicted[i] = qp->multiplier[i] + qp->slope[i] * change;
-    }
+    for (int i = 0; i < ROW_ROOM; i++) qp->value[i] -= (1.0 - fraction) * qp->change[i];
+    find_pieces(&s->problem, s->model.row_value, qp);
 }
 
-/* Multipliers and slopes at the point reached; whether they are what the pieces foretold. */
-static bool update_multipliers(const problem_data *p, active_set *qp)
+static bool is_foretold(const active_set *qp)
 {
     double largest = 0.0;
-    for (int i = 0; i < ROWS; i++) {
-        qp->multiplier[i] = penalty_multiplier(p, i, qp->estimate[i], qp->row_target[i], &qp->slope[i]);
-        largest = fmax(largest, fabs(qp->multiplier[i] - qp->predicted[i]));
+    for (int n = 0; n < qp->n_engaged; n++) {
+        const int i = qp->engaged[n];
+        largest = larger(largest, fabs(qp->multiplier[i] - qp->foretold[i]));
     }
     return largest < SAME_MULTIPLIER;
 }
@@ -168,27 +253,43 @@ static bool update_multipliers(const problem_data *p, active_set *qp)
 static double largest_violation(const active_set *qp)
 {
     double largest = 0.0;
-    for (int i = 0; i < ROWS; i++) largest = fmax(largest, fabs(qp->multiplier[i] - qp->estimate[i]) / WEIGHT);
-    return largest;
-}
-
-static void update_estimates(const problem_data *p, active_set *qp)
-{
-    memcpy(qp->estimate, qp->multiplier, sizeof qp->estimate);
-    for (int i = 0; i < ROWS; i++) qp->multiplier[i] = penalty_multiplier(p, i, qp->estimate[i], qp->row_target[i], &qp->slope[i]);
-}
-
-static void newton_point(nmpc_solver *s)
-{
-    active_set *qp = &s->qp;
-    for (int i = 0; i < ROWS; i++) {
-        s->kkt.row_gradient[i] = qp->multiplier[i] + qp->slope[i] * (s->model.row_value[i] - qp->row_target[i]);
+    for (int n = 0; n < qp->n_engaged; n++) {
+        const int i = qp->engaged[n];
+        largest = larger(largest, fabs(qp->multiplier[i] - qp->estimate[i]));
     }
-    riccati_solve(&s->problem, &s->current, &s->model, &s->kkt);
-    s->statistics.qp_iterations++;
-    s->statistics.work += WORK_SOLUTION;
-    row_products(&s->problem, s->kkt.step, qp->row_change);
-    for (int i = 0; i < ROWS; i++) qp->row_change[i] += s->model.row_value[i] - qp->row_target[i];
+    return largest / qp->weight;
+}
+
+/* How far to go on beyond e := m, in changes of m since the last estimates. */
+static double extrapolation(const active_set *qp)
+{
+    double along = 0.0, size = 0.0;
+    for (int n = 0; n < qp->n_engaged; n++) {
+        const int i = qp->engaged[n];
+        const double correction = qp->multiplier[i] - qp->estimate[i], change = correction - qp->last_correction[i];
+        along -= correction * change;
+        size += change * change;
+    }
+    return along > 0.0 ? fmin(along / size, LARGEST_EXTRAPOLATION) : 0.0;
+}
+
+/* Where the violation has not become much smaller, with a larger weight from now on. */
+static void update_estimates(const problem_data *p, const row_array row_value, double violation, active_set *qp)
+{
+    const double beyond = qp->has_last ? extrapolation(qp) : 0.0;
+    for (int n = 0; n < qp->n_engaged; n++) {
+        const int i = qp->engaged[n];
+        const double multiplier = qp->multiplier[i];
+        const double change = qp->has_last ? multiplier - qp->last_multiplier[i] : 0.0;
+        qp->last_correction[i] = multiplier - qp->estimate[i];
+        qp->last_multiplier[i] = multiplier;
+        qp->estimate[i] = multiplier + beyond * change;
+    }
+    const bool is_slow = violation > GOOD_DECREASE * qp->violation && qp->weight < LARGEST_WEIGHT;
+    if (is_slow) qp->weight *= WEIGHT_GROWTH;
+    qp->has_last = !is_slow;
+    qp->violation = violation;
+    find_pieces(p, row_value, qp);
 }
 
 /* Step and row multipliers into s->qp, gap multipliers into s->kkt. When a cap is met first: the point reached until then. */
@@ -198,24 +299,25 @@ bool quadratic_program(nmpc_solver *s, bool is_same_hessian)
     const int last_factorization = s->statistics.factorizations + MAX_FACTORIZATIONS;
     if (!is_same_hessian) {
         s->kkt.exact_share = 1.0;
-        qp->has_factor = false;
+        qp->weight = FIRST_WEIGHT;
     }
-    start(&s->problem, &s->current, &s->model, qp);
+    start(&s->problem, &s->current, s->model.row_value, qp);
     int estimates = 0;
-    for (int i = 0; i < MAX_SOLUTIONS; i++) {
-        if (!qp->has_factor || memcmp(s->kkt.row_weight, qp->slope, sizeof qp->slope) != 0) {
-            if (s->statistics.factorizations >= last_factorization) break;
-            memcpy(s->kkt.row_weight, qp->slope, sizeof qp->slope);
-            if (!factorize(s)) return false;
-            qp->has_factor = true;
-        }
-        newton_point(s);
+    for (int i = 0; i < MAX_SOLUTIONS && s->statistics.factorizations < last_factorization; i++) {
+        if (!newton_point(s, i == 0 && !is_same_hessian, i == 0)) return false;
+        find_pieces(&s->problem, s->model.row_value, qp);
+        find_engaged(&s->kkt, s->model.row_value, qp);
         const double fraction = i == 0 ? 1.0 : exact_line_search(s);
+        const bool is_minimum = fraction == 1.0 && is_foretold(qp);
         move(s, fraction, qp);
-        const bool is_foretold = update_multipliers(&s->problem, qp);
-        if (!is_foretold || fraction < 1.0) continue;
-        if (largest_violation(qp) < LARGEST_VIOLATION || ++estimates == MAX_ESTIMATES) break;
-        update_estimates(&s->problem, qp);
+        if (!is_minimum) {
+            qp->has_last = false;
+            continue;
+        }
+        const double violation = largest_violation(qp);
+        if (violation < LARGEST_VIOLATION || ++estimates == MAX_ESTIMATES) break;
+        update_estimates(&s->problem, s->model.row_value, violation, qp);
     }
+    riccati_gap_multipliers(&s->kkt);
     return true;
 }

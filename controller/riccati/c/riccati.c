@@ -8,21 +8,22 @@
  * for which the recursion is (Rawlings, Mayne, Diehl: Model Predictive Control, section 8.8.3, with a cross term)
  *
  *   M = H + (0, 2S) + W' P_next W,  W = (J; 0 I),  m = g + W' (p_next + P_next (gap; 0))
- *   du = -K s - k,  K = M_uu^-1 (M_ux, -2S),  k = M_uu^-1 m_u
- *   P = diag(M_xx, 2S) - (M_ux, -2S)' K,  p = (m_x, -2S (u_k - u_k-1)) - K' m_u
+ *   M_uu = L D L',  C = (M_ux, -2S),  du = -K s - k,  K = M_uu^-1 C,  k = M_uu^-1 m_u
+ *   P = diag(M_xx, 2S) - (L^-1 C)' D^-1 (L^-1 C),  p = (m_x, -2S (u_k - u_k-1)) - K' m_u
  *
- * The factorization (P, K) needs the matrices alone, the solution (p, k, d) is repeated for other right-hand sides.
+ * The factorization (P, K) needs the matrices alone, the solution (p, k, d) is repeated for other right-hand sides. Both go from the
+ * last stage to the first, so that a change at one stage leaves the later ones as they are.
  */
 #include <math.h>
 #include <string.h>
 
 #include "solver.h"
 
-/* Pivots below these have no descent: curvature per unit of input, and of the second after the first. */
-#define SMALLEST_PIVOT 1e-8
-#define SMALLEST_DETERMINANT 1e-9
+#define SMALLEST_PIVOT 1e-8 /* curvature per unit of input below which there is no descent */
 
-typedef double square[NZ][NZ];
+typedef stage_row square[NZ];
+
+static const stage_row INPUT_PART = {[NX ... NZ - 1] = 1.0};
 
 static void add_corridor_weight(const double normal[2], double weight, square matrix)
 {
@@ -32,110 +33,137 @@ static void add_corridor_weight(const double normal[2], double weight, square ma
     matrix[Y][Y] += weight * normal[1] * normal[1];
 }
 
-/* M = H + W' P W. */
+/* M = H + W' P W. The columns of J that belong to X and Y are those of the identity: the model does not know where it is. */
 static void stage_matrix(const problem_data *p, const linearization *model, const riccati *kkt, int k, square M)
 {
-    const double(*restrict J)[NZ] = model->jacobian[k], (*restrict H)[NZ] = model->hessian[k];
-    const double(*restrict P)[NZ] = kkt->value_hessian[k + 1];
+    const stage_row *J = model->jacobian[k], *H = model->hessian[k], *P = kkt->value_hessian[k + 1];
     square PW;
     for (int i = 0; i < NZ; i++) {
-        double sum[NZ] = {0};
-        for (int j = NX; j < NZ; j++) sum[j] = P[i][j];
-        for (int l = 0; l < NX; l++) {
-            for (int j = 0; j < NZ; j++) sum[j] += P[i][l] * J[l][j];
-        }
-        memcpy(PW[i], sum, sizeof sum);
+        stage_vector sum = product(P[i], INPUT_PART);
+        for (int l = 0; l < NX; l++) sum = plus(sum, P[i][l], J[l]);
+        store(PW[i], sum);
     }
     for (int i = 0; i < NZ; i++) {
-        double sum[NZ];
-        for (int j = 0; j < NZ; j++) sum[j] = kkt->exact_share * H[i][j] + (i >= NX ? PW[i][j] : 0.0);
-        for (int l = 0; l < NX; l++) {
-            for (int j = 0; j < NZ; j++) sum[j] += J[l][i] * PW[l][j];
-        }
-        memcpy(M[i], sum, sizeof sum);
+        stage_vector sum = scaled(kkt->exact_share, H[i]);
+        if (i >= NX || i == X || i == Y) sum = plus(sum, 1.0, PW[i]);
+        for (int l = 0; l < NX && i != X && i != Y; l++) sum = plus(sum, J[l][i], PW[l]);
+        store(M[i], sum);
     }
     const double *weight = &kkt->row_weight[k * STAGE_ROWS];
-    for (int j = 0; j < NZ; j++) M[j][j] += 2.0 * p->weight[j] + (j >= NX ? 2.0 * p->difference_weight[j - NX] : 0.0);
+    for (int j = 0; j < NZ; j++) M[j][j] += 2.0 * p->weight[j];
+    for (int j = 0; j < NU; j++) M[NX + j][NX + j] += 2.0 * p->difference_weight[j];
     for (int i = 0; i < STAGE_BOUNDS; i++) M[BOUNDED_COMPONENT[i]][BOUNDED_COMPONENT[i]] += weight[i];
     add_corridor_weight(p->normal[k], weight[STAGE_BOUNDS], M);
 }
 
-/* Inverse of M_uu as (11, 12, 22); false when it is not positive definite. */
-static bool invert_pivot(square M, double inverse[3])
+/* L below the diagonal and 1 / D on it; false when M_uu is not positive definite. */
+static bool factorize_pivot(square M, double pivot[NU][NU])
 {
-    const double a = M[NX][NX], b = M[NX][NX + 1], c = M[NX + 1][NX + 1], determinant = a * c - b * b;
-    if (!(a > SMALLEST_PIVOT && determinant > SMALLEST_DETERMINANT * a && isfinite(determinant))) return false;
-    inverse[0] = c / determinant;
-    inverse[1] = -b / determinant;
-    inverse[2] = a / determinant;
+    for (int j = 0; j < NU; j++) {
+        double d = M[NX + j][NX + j];
+        for (int l = 0; l < j; l++) d -= pivot[j][l] * pivot[j][l] / pivot[l][l];
+        if (!(d > SMALLEST_PIVOT && d < INFINITY)) return false;
+        pivot[j][j] = 1.0 / d;
+        for (int i = j + 1; i < NU; i++) {
+            double sum = M[NX + i][NX + j];
+            for (int l = 0; l < j; l++) sum -= pivot[i][l] * pivot[j][l] / pivot[l][l];
+            pivot[i][j] = sum * pivot[j][j];
+        }
+    }
     return true;
 }
 
+/* K and P. */
 static void eliminate_input(const problem_data *p, riccati *kkt, int k, square M)
 {
-    const double *inverse = kkt->inverse_pivot[k];
-    double(*restrict K)[NZ] = kkt->feedback[k], (*restrict P)[NZ] = kkt->value_hessian[k];
-    double cross[NU][NZ]; /* (M_ux, -2S) */
+    const double(*L)[NU] = kkt->pivot[k];
+    stage_row *K = kkt->feedback[k], *P = kkt->value_hessian[k], reduced[NU]; /* L^-1 C */
     for (int i = 0; i < NU; i++) {
-        for (int j = 0; j < NX; j++) cross[i][j] = M[NX + i][j];
-        for (int j = 0; j < NU; j++) cross[i][NX + j] = i == j ? -2.0 * p->difference_weight[i] : 0.0;
+        for (int j = 0; j < NU; j++) M[NX + i][NX + j] = i == j ? -2.0 * p->difference_weight[i] : 0.0; /* now C */
+        stage_vector sum = load(M[NX + i]);
+        for (int l = 0; l < i; l++) sum = plus(sum, -L[i][l], reduced[l]);
+        store(reduced[i], sum);
+        store(K[i], scaled(L[i][i], reduced[i]));
     }
-    for (int j = 0; j < NZ; j++) {
-        K[0][j] = inverse[0] * cross[0][j] + inverse[1] * cross[1][j];
-        K[1][j] = inverse[1] * cross[0][j] + inverse[2] * cross[1][j];
+    for (int i = 0; i < NX; i++) {
+        for (int j = NX; j < NZ; j++) M[i][j] = 0.0;
+    }
+    for (int i = NX; i < NZ; i++) {
+        for (int j = 0; j < NX; j++) M[i][j] = 0.0;
+        M[i][i] = 2.0 * p->difference_weight[i - NX];
     }
     for (int i = 0; i < NZ; i++) {
-        for (int j = 0; j < NZ; j++) {
-            const double own = i < NX && j < NX ? M[i][j] : i == j ? 2.0 * p->difference_weight[i - NX] : 0.0;
-            P[i][j] = own - cross[0][i] * K[0][j] - cross[1][i] * K[1][j];
-        }
+        stage_vector sum = load(M[i]);
+        for (int l = 0; l < NU; l++) sum = plus(sum, -reduced[l][i], K[l]);
+        store(P[i], sum);
+    }
+    for (int i = NU - 2; i >= 0; i--) {
+        stage_vector sum = load(K[i]);
+        for (int l = i + 1; l < NU; l++) sum = plus(sum, -L[l][i], K[l]);
+        store(K[i], sum);
     }
 }
 
-bool riccati_factorize(const problem_data *p, const linearization *model, riccati *kkt)
+bool riccati_factorize(const problem_data *p, const linearization *model, int last, riccati *kkt)
 {
-    double(*P)[NZ] = kkt->value_hessian[N];
-    memset(P, 0, sizeof(square));
-    for (int j = 0; j < NX; j++) P[j][j] = 2.0 * p->last_weight[j] + kkt->row_weight[LAST_ROW + j];
-    add_corridor_weight(p->normal[N], kkt->row_weight[LAST_ROW + NX], P);
-    for (int k = N - 1; k >= 0; k--) {
+    if (last == N) {
+        stage_row *P = kkt->value_hessian[N];
+        memset(P, 0, sizeof(square));
+        for (int j = 0; j < NX; j++) P[j][j] = 2.0 * p->last_weight[j] + kkt->row_weight[LAST_ROW + j];
+        add_corridor_weight(p->normal[N], kkt->row_weight[LAST_ROW + NX], P);
+    }
+    for (int k = last < N ? last : N - 1; k >= 0; k--) {
         square M;
         stage_matrix(p, model, kkt, k, M);
-        if (!invert_pivot(M, kkt->inverse_pivot[k])) return false;
+        if (!factorize_pivot(M, kkt->pivot[k])) return false;
         eliminate_input(p, kkt, k, M);
     }
     return true;
 }
 
-/* p and k of the stages, from the last to the first. */
-static void backward(const problem_data *p, const iterate *at, const linearization *model, riccati *kkt)
+/* k = M_uu^-1 m_u */
+static void solve_pivot(double pivot[NU][NU], const double m[NU], double k[NU])
 {
-    memcpy(kkt->value_gradient[N], model->gradient[N], sizeof kkt->value_gradient[N]); /* without input: zeros there */
-    add_row_gradients(p, N, kkt->row_gradient, kkt->value_gradient[N]);
-    for (int k = N - 1; k >= 0; k--) {
-        const double(*restrict J)[NZ] = model->jacobian[k];
-        double(*restrict P)[NZ] = kkt->value_hessian[k + 1];
-        double next[NZ], m[NZ];
-        for (int i = 0; i < NZ; i++) next[i] = kkt->value_gradient[k + 1][i];
-        for (int l = 0; l < NX; l++) { /* P is symmetric: by columns, which are rows in memory */
-            for (int i = 0; i < NZ; i++) next[i] += P[l][i] * model->gap[k][l];
-        }
-        for (int j = 0; j < NZ; j++) m[j] = model->gradient[k][j] + (j >= NX ? next[j] : 0.0);
-        for (int l = 0; l < NX; l++) {
-            for (int j = 0; j < NZ; j++) m[j] += J[l][j] * next[l];
-        }
-        add_row_gradients(p, k, kkt->row_gradient, m);
-        const double *inverse = kkt->inverse_pivot[k], *previous = k > 0 ? &at->z[k - 1][NX] : p->previous_input;
-        kkt->feedforward[k][0] = inverse[0] * m[NX] + inverse[1] * m[NX + 1];
-        kkt->feedforward[k][1] = inverse[1] * m[NX] + inverse[2] * m[NX + 1];
-        for (int j = 0; j < NZ; j++) {
-            const double own = j < NX ? m[j] : -2.0 * p->difference_weight[j - NX] * (at->z[k][j] - previous[j - NX]);
-            kkt->value_gradient[k][j] = own - kkt->feedback[k][0][j] * m[NX] - kkt->feedback[k][1][j] * m[NX + 1];
-        }
+    for (int i = 0; i < NU; i++) {
+        k[i] = m[i];
+        for (int l = 0; l < i; l++) k[i] -= pivot[i][l] * k[l];
+    }
+    for (int i = NU - 1; i >= 0; i--) {
+        k[i] *= pivot[i][i];
+        for (int l = i + 1; l < NU; l++) k[i] -= pivot[l][i] * k[l];
     }
 }
 
-/* Steps and multipliers of the stages, from the first to the last. */
+/* p and k of the stages, from the last to the first. */
+static void backward(const problem_data *p, const iterate *at, const linearization *model, int last, riccati *kkt)
+{
+    if (last == N) {
+        memcpy(kkt->value_gradient[N], model->gradient[N], sizeof kkt->value_gradient[N]); /* without input: zeros there */
+        add_row_gradients(p, N, kkt->row_gradient, kkt->value_gradient[N]);
+    }
+    for (int k = last < N ? last : N - 1; k >= 0; k--) {
+        const stage_row *J = model->jacobian[k], *P = kkt->value_hessian[k + 1];
+        stage_row next, m;
+        stage_vector sum = load(kkt->value_gradient[k + 1]);
+        for (int l = 0; l < NX; l++) sum = plus(sum, model->gap[k][l], P[l]); /* P is symmetric: by columns, which are rows in memory */
+        store(next, sum);
+        sum = load(model->gradient[k]);
+        for (int l = 0; l < NX; l++) sum = plus(sum, next[l], J[l]);
+        store(m, sum);
+        for (int j = NX; j < NZ; j++) m[j] += next[j];
+        add_row_gradients(p, k, kkt->row_gradient, m);
+        solve_pivot(kkt->pivot[k], &m[NX], kkt->feedforward[k]);
+        const double *previous = k > 0 ? &at->z[k - 1][NX] : p->previous_input;
+        double m_u[NU];
+        memcpy(m_u, &m[NX], sizeof m_u);
+        for (int j = NX; j < NZ; j++) m[j] = -2.0 * p->difference_weight[j - NX] * (at->z[k][j] - previous[j - NX]);
+        sum = load(m);
+        for (int l = 0; l < NU; l++) sum = plus(sum, -m_u[l], kkt->feedback[k][l]);
+        store(kkt->value_gradient[k], sum);
+    }
+}
+
+/* Steps of the stages, from the first to the last. */
 static void forward(const linearization *model, riccati *kkt)
 {
     double s[NZ] = {0}; /* (dx_k, du_k-1) */
@@ -153,18 +181,26 @@ static void forward(const linearization *model, riccati *kkt)
             s[i] = sum;
         }
         memcpy(&s[NX], &d[NX], NU * sizeof *s);
-        for (int i = 0; i < NX; i++) {
-            double sum = kkt->value_gradient[k + 1][i];
-            for (int j = 0; j < NZ; j++) sum += kkt->value_hessian[k + 1][i][j] * s[j];
-            kkt->gap_multiplier[k + 1][i] = sum;
-        }
     }
     memcpy(kkt->step[N], s, NX * sizeof *s);
     memset(&kkt->step[N][NX], 0, NU * sizeof *s);
 }
 
-void riccati_solve(const problem_data *problem, const iterate *at, const linearization *model, riccati *kkt)
+void riccati_solve(const problem_data *problem, const iterate *at, const linearization *model, int last, riccati *kkt)
 {
-    backward(problem, at, model, kkt);
+    backward(problem, at, model, last, kkt);
     forward(model, kkt);
+}
+
+/* Gradients of the value functions at the solution. */
+void riccati_gap_multipliers(riccati *kkt)
+{
+    for (int k = 1; k <= N; k++) {
+        stage_row multiplier;
+        stage_vector sum = load(kkt->value_gradient[k]);
+        for (int l = 0; l < NX; l++) sum = plus(sum, kkt->step[k][l], kkt->value_hessian[k][l]);
+        for (int l = NX; l < NZ; l++) sum = plus(sum, kkt->step[k - 1][l], kkt->value_hessian[k][l]);
+        store(multiplier, sum);
+        memcpy(kkt->gap_multiplier[k], multiplier, sizeof kkt->gap_multiplier[k]);
+    }
 }

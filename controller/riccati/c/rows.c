@@ -3,10 +3,8 @@
  */
 #include "solver.h"
 
-static int corridor_row(int k) { return k < N ? k * STAGE_ROWS + STAGE_BOUNDS : LAST_ROW + NX; }
-
 /* Values of the rows for a linear argument: of a step, or of anything where the corridor is measured from the origin. */
-void row_products(const problem_data *p, const double z[N + 1][NZ], double product[ROWS])
+void row_products(const problem_data *p, const double z[N + 1][NZ], row_array product)
 {
     for (int k = 0; k < N; k++) {
         double *row = &product[k * STAGE_ROWS];
@@ -15,9 +13,10 @@ void row_products(const problem_data *p, const double z[N + 1][NZ], double produ
     }
     for (int j = 0; j < NX; j++) product[LAST_ROW + j] = z[N][j];
     product[LAST_ROW + NX] = p->normal[N][0] * z[N][X] + p->normal[N][1] * z[N][Y];
+    for (int i = ROWS; i < ROW_ROOM; i++) product[i] = 0.0;
 }
 
-void row_values(const problem_data *p, const iterate *at, double value[ROWS])
+void row_values(const problem_data *p, const iterate *at, row_array value)
 {
     row_products(p, at->z, value);
     for (int k = 0; k <= N; k++) { /* by the difference, for the sake of digits far from the origin */
@@ -37,4 +36,16 @@ void add_row_gradients(const problem_data *p, int k, const double row[ROWS], dou
     }
     gradient[X] += p->normal[k][0] * row[corridor_row(k)];
     gradient[Y] += p->normal[k][1] * row[corridor_row(k)];
+}
+
+void clip_inputs(const problem_data *p, iterate *point)
+{
+    for (int k = 0; k < N; k++) {
+        const double *lower = &p->lower[k * STAGE_ROWS], *upper = &p->upper[k * STAGE_ROWS];
+        double *input = &point->z[k][NX];
+        for (int j = 0; j < NU; j++) {
+            if (input[j] > upper[j]) input[j] = upper[j];
+            if (input[j] < lower[j]) input[j] = lower[j];
+        }
+    }
 }

@@ -3,19 +3,21 @@
 import ctypes
 import subprocess
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from controller.bench import RecordingSolver
-from controller.bench_loop import drive, nominal_scenarios
+from controller.bench_loop import drive
+from controller.bench_scenarios import nominal_scenarios
+from controller.bench_sets import RecordingSolver
 from controller.build import find_compiler
 from controller.compiled import CompiledBackEnd
 from controller.nmpc import Nmpc
 from controller.problem import OcpOptions
 from controller.riccati.build import SCALAR, build_riccati, write_sources
 from controller.riccati.solver import RiccatiSolver
-from controller.solver import SqpSolver
+from controller.solver import SolveStatus, SqpSolver
 
 
 @pytest.fixture(scope="session")
@@ -29,9 +31,14 @@ def scalar_library(vehicle):
 
 
 @pytest.fixture(params=["vector", "scalar"])
-def riccati(request):
-    name = {"vector": "riccati_library", "scalar": "scalar_library"}[request.param]
-    return RiccatiSolver(request.getfixturevalue(name), OcpOptions())
+def form(request):
+    return request.param
+
+
+@pytest.fixture
+def riccati(request, form):
+    library = {"vector": "riccati_library", "scalar": "scalar_library"}[form]
+    return RiccatiSolver(request.getfixturevalue(library), OcpOptions())
 
 
 @pytest.fixture(scope="session")
@@ -72,6 +79,31 @@ def load_c(compile_c, tmp_path_factory):
         return ctypes.CDLL(str(compile_c(tmp_path_factory.mktemp("library") / "test.so", sources, "-shared", "-fPIC", *flags)))
 
     return load
+
+
+@pytest.fixture(scope="session")
+def same_under_sanitizers(compile_c, tmp_path_factory):
+    """Whether a program that is compiled with the sanitizers, and knows the public header alone, gives the answers of a solver."""
+
+    def check(solver, sources, flags, problems):
+        directory = tmp_path_factory.mktemp("sanitized")
+        c_files = [Path(__file__).parent / "solve_file.c", *sorted(sources.glob("*.c"))]
+        sanitizers = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+        program = compile_c(directory / "solve", c_files, f"-I{sources}", "-O0", *sanitizers, *flags)
+        b, expected = solver._buffers, []
+        with (directory / "problems").open("wb") as file:
+            for state, previous_input, horizon, warm_start in problems:
+                solver.warm_start = warm_start
+                result = solver.solve(state, previous_input, horizon)
+                expected.append((result.status, b.w.copy()))
+                np.concatenate((b.w0, b.lam_w0, b.lam_g0, b.p, b.lower_w, b.upper_w, b.lower_g, b.upper_g)).tofile(file)
+        subprocess.run([program, directory / "problems", directory / "answers"], check=True, timeout=60)
+        answers = np.fromfile(directory / "answers").reshape(len(expected), -1)
+        for answer, (status, w) in zip(answers, expected, strict=True):
+            assert (answer[0] == 0.0) == (status is SolveStatus.CONVERGED)
+            np.testing.assert_allclose(answer[1:], w, rtol=0, atol=1e-4)
+
+    return check
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,238 @@
+"""Telemetry: what every process tells the world, as JSON over Zenoh.
+
+Each process that publishes listens on its own loopback port; readers connect to all of them. Nothing is discovered, nothing
+leaves the machine, and a slow reader loses samples rather than holding a publisher up. Readers judge the age of a sample
+themselves: `t_ns` is CLOCK_MONOTONIC of the sending host, and samples that waited in a socket arrive late, not marked.
+
+The control thread calls `Publisher.post`, which only stores a reference; encoding and sending happen on a thread of its own.
+
+A publisher may also answer requests (`Publisher.serve`, `ask`): one JSON text there, one back, over the same port. Answers are
+made on threads of Zenoh, one for each client at most, so that a crowd of clients waits for itself and for nobody else.
+"""
+
+import json
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Self
+
+import msgspec
+import zenoh
+
+from dbc.errors import SetupFailure
+from gateway.telemetry.samples import (
+    TOPICS,
+    CommandSample,
+    Lane,
+    ObjectsSample,
+    ParameterChange,
+    ParametersSample,
+    PlanSample,
+    ProfileSample,
+    Sample,
+    SceneSample,
+    Source,
+    StateSample,
+    StatusSample,
+    WorldObject,
+    WorldSample,
+    decode,
+    port_of,
+    topic_of,
+)
+
+__all__ = [
+    "DEFAULT_BASE_PORT",
+    "KEY_PREFIX",
+    "MAX_REQUEST_BYTES",
+    "TOPICS",
+    "CommandSample",
+    "Lane",
+    "ObjectsSample",
+    "ParameterChange",
+    "ParametersSample",
+    "PlanSample",
+    "ProfileSample",
+    "Publisher",
+    "Sample",
+    "SceneSample",
+    "Source",
+    "StateSample",
+    "StatusSample",
+    "Subscriber",
+    "TelemetryError",
+    "WorldObject",
+    "WorldSample",
+    "ask",
+    "decode",
+    "new_boot_id",
+    "port_of",
+    "topic_of",
+]
+
+DEFAULT_BASE_PORT = 7447
+KEY_PREFIX = "xilgate"
+_QUEUE_LENGTH = 256
+_MAX_MESSAGE_BYTES = 1 << 24
+"""A longer message is dropped while it arrives [bytes]: what a stranger sends does not fill our memory."""
+MAX_REQUEST_BYTES = 1 << 16
+"""Longest request that is looked at [bytes]."""
+_ASK_PERIOD_S = 0.02
+
+
+class TelemetryError(SetupFailure):
+    """Telemetry cannot be opened; one line that says why."""
+
+
+def _session(listen: list[str], connect: list[str], within_s: float | None = None) -> zenoh.Session:
+    """A session on these endpoints alone; with `within_s` it is an error when nobody answers in that time [s]."""
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "listen/endpoints": listen,
+        "connect/endpoints": connect,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    if within_s is not None:
+        config.insert_json5("connect/exit_on_failure", "true")
+        config.insert_json5("connect/timeout_ms", str(round(within_s * 1e3)))
+    return zenoh.open(config)
+
+
+class Publisher:
+    """Publishes samples of one source from a thread of its own.
+
+    Raises:
+        TelemetryError: the port of the source is busy.
+    """
+
+    def __init__(self, source: Source, base_port: int = DEFAULT_BASE_PORT) -> None:
+        port = port_of(source, base_port)
+        self._source = source
+        try:
+            self._session = _session([f"tcp/127.0.0.1:{port}"], [])
+        except zenoh.ZError as error:
+            raise TelemetryError(
+                f"telemetry port {port} of the {source} is busy; is another run active? Choose another with --telemetry-port"
+            ) from error
+        self._publishers = {
+            topic: self._session.declare_publisher(f"{KEY_PREFIX}/{topic}", congestion_control=zenoh.CongestionControl.DROP)
+            for topic, (owner, _) in TOPICS.items()
+            if owner is source
+        }
+        self._services: list[zenoh.Queryable[None]] = []
+        self._encoder = msgspec.json.Encoder()
+        self._queue: deque[Sample] = deque(maxlen=_QUEUE_LENGTH)
+        self._wake = threading.Event()
+        self._is_closing = False
+        self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
+        self._thread.start()
+
+    def post(self, sample: Sample) -> None:
+        """Hand a sample over; never blocks. When the thread cannot keep up, the oldest samples are lost."""
+        self._queue.append(sample)
+        self._wake.set()
+
+    def serve(self, service: str, answer: Callable[[bytes], bytes]) -> None:
+        """Answer requests on the key `xilgate/SOURCE/SERVICE` from now on; see `ask`.
+
+        Args:
+            answer: is called on threads of Zenoh, on several at once when several clients ask.
+        """
+        key = _service_key(self._source, service)
+
+        def reply(query: zenoh.Query) -> None:
+            with query:
+                payload = query.payload or zenoh.ZBytes()
+                if len(payload) > MAX_REQUEST_BYTES:
+                    query.reply_err(f"request of {len(payload)} bytes: at most {MAX_REQUEST_BYTES}")
+                else:
+                    query.reply(key, answer(payload.to_bytes()))
+
+        self._services.append(self._session.declare_queryable(key, zenoh.handlers.Callback(reply, indirect=False)))
+
+    def _run(self) -> None:
+        while not (self._is_closing and not self._queue):
+            self._wake.wait(timeout=0.5)
+            self._wake.clear()
+            while self._queue:
+                sample = self._queue.popleft()
+                self._publishers[topic_of(sample)].put(self._encoder.encode(sample))
+
+    def close(self) -> None:
+        """Send what is queued and leave."""
+        self._is_closing = True
+        self._wake.set()
+        self._thread.join(timeout=2.0)
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Subscriber:
+    """Calls `on_sample(topic, payload)` for every sample of `topics`, on a thread of Zenoh.
+
+    The payload is the JSON text as it came; `decode` turns it into a sample.
+    """
+
+    def __init__(self, on_sample: Callable[[str, bytes], None], topics: list[str], base_port: int = DEFAULT_BASE_PORT) -> None:
+        sources = {TOPICS[topic][0] for topic in topics}
+        self._session = _session([], [f"tcp/127.0.0.1:{port_of(source, base_port)}" for source in sorted(sources)])
+
+        def receive(topic: str) -> "zenoh.handlers.Callback[zenoh.Sample]":
+            # indirect=False: no Python thread of Zenoh's that would keep the interpreter from exiting.
+            return zenoh.handlers.Callback(lambda sample: on_sample(topic, sample.payload.to_bytes()), indirect=False)
+
+        self._subscribers = [self._session.declare_subscriber(f"{KEY_PREFIX}/{topic}", receive(topic)) for topic in topics]
+
+    def close(self) -> None:
+        """Leave; no callback comes after this."""
+        self._session.close()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _service_key(source: Source, service: str) -> str:
+    return f"{KEY_PREFIX}/{source}/{service}"
+
+
+def ask(source: Source, service: str, request: bytes, base_port: int = DEFAULT_BASE_PORT, timeout_s: float = 2.0) -> bytes:
+    """Send a request to a service of a running process, once, and wait for the answer.
+
+    Raises:
+        TelemetryError: the process does not run, does not answer in time, or does not take the request.
+    """
+    port = port_of(source, base_port)
+    deadline_s = time.monotonic() + timeout_s
+    try:
+        session = _session([], [f"tcp/127.0.0.1:{port}"], timeout_s)
+    except zenoh.ZError as error:
+        raise TelemetryError(f"no {source} answers on telemetry port {port}; name the ports of your run with --telemetry-port") from error
+    with session:
+        while time.monotonic() < deadline_s:
+            for reply in session.get(_service_key(source, service), payload=request, timeout=timeout_s):
+                if reply.ok is not None:
+                    return reply.ok.payload.to_bytes()
+                refusal = reply.err.payload.to_string() if reply.err is not None else ""
+                raise TelemetryError(f"{source} on telemetry port {port}, {service}: {refusal}")
+            time.sleep(_ASK_PERIOD_S)  # nobody took the request: the process has not declared its service yet
+    raise TelemetryError(f"the {source} on telemetry port {port} serves no {service}")
+
+
+def new_boot_id() -> int:
+    """A number that tells this start of a process from every other."""
+    return int.from_bytes(os.urandom(4))
