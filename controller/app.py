@@ -11,8 +11,8 @@ from controller.inbox import ObjectInbox
 from controller.nmpc import DRIVE_MODEL, Nmpc, NmpcOptions
 from controller.objects import nearest
 from controller.parameters import ParameterStore
+from controller.planning.reference import ReferencePath
 from controller.problem import OcpOptions
-from controller.reference import ReferencePath
 from controller.samples import Circumstances, ProfileMeter, command_sample, parameters_sample, plan_sample
 from controller.solver import Solver
 from controller.solvers import DEFAULT_SOLVER, make_solver

@@ -10,10 +10,10 @@ from controller.delay import actuation_delays_s
 from controller.disturbance import DisturbanceOptions
 from controller.estimator import StateEstimator
 from controller.fallback import Fallback, Plan
-from controller.obstacles import Obstacle
-from controller.planner import Planner, PlannerOptions, lateral_offset
+from controller.planning.obstacles import Obstacle
+from controller.planning.planner import Planner, PlannerOptions, lateral_offset
+from controller.planning.reference import ReferencePath
 from controller.problem import N_CAR_STATES, SINGLE_TRACK_LAG, Array, Horizon, Model, OcpOptions
-from controller.reference import ReferencePath
 from controller.solver import Solver, SolveResult, SolveStatus
 from dbc.vehicle import Vehicle
 from gateway.messages import HORIZON_STEPS, PLAN_PERIOD_NS, ControlCommand, Mode, VehicleState

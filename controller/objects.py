@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from controller.obstacles import Obstacle
+from controller.planning.obstacles import Obstacle
 from controller.problem import Array
 from gateway.telemetry import ObjectsSample, WorldObject
 

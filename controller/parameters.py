@@ -16,7 +16,7 @@ from typing import Any, TypeAlias, TypeVar
 
 import msgspec
 
-from controller.planner_options import RANGES, PlannerOptions
+from controller.planning.options import RANGES, PlannerOptions
 from controller.problem import OcpOptions
 from dbc.errors import UserMistake
 from gateway.telemetry import ParameterChange
@@ -110,7 +110,7 @@ _PLANNER_NUMBERS = {
     "search_slack_m": "by how much the search for the closest point exceeds the distance driven",
     "corridor_relief_m": "room left to a car found outside the corridor, beyond where it is",
 }
-"""What people read of each number of the planner; ranges are those of `planner_options.RANGES`."""
+"""What people read of each number of the planner; ranges are those of `planning.options.RANGES`."""
 _UNIT_OF_SUFFIX = {"_mps2": "m/s²", "_mps": "m/s", "_radpm": "1/m", "_m": "m", "_s": "s"}
 _NORTHLESS = ("state_weights", "terminal_weights")
 """Here X and Y weigh alike: the cost must not know north."""

@@ -32,9 +32,9 @@ PURE_MODULES = {
         *("limits", "actuation", "safe_stop", "core"),
     ),
     "controller": (
-        *("problem", "model", "integrator", "ocp", "reference"),
-        *("planner", "planner_options", "localiser", "obstacles", "corridor", "shift", "linking", "passing", "speed"),
-        *("reference_sources", "delay", "disturbance", "estimator", "nmpc", "fallback"),
+        *("problem", "model", "integrator", "ocp", "delay", "disturbance", "estimator", "nmpc", "fallback", "parameters", "objects"),
+        *(f"planning/{name}" for name in ("planner", "options", "localiser", "obstacles", "corridor", "shift", "linking", "passing")),
+        *("planning/speed", "planning/reference", "planning/reference_sources"),
     ),
     "vehicle_emulator": (
         *("plant", "actuators", "robots", "ins", "emulator"),

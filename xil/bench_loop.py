@@ -1,6 +1,6 @@
 """`xilgate bench loop`: what the controller makes of noise, slow robots, slopes and a heavy car, in closed loop in virtual time.
 
-`loss`: the controller's own small car (`controller.bench_loop`), four times the noise of the navigation system, throttle and
+`loss`: the controller's own small car (`controller.bench.loop`), four times the noise of the navigation system, throttle and
 corridor at their limits. `delay` and `slope`: the emulated car behind gateway and bus, stage sil. `cost`: CPU time of a step.
 """
 
@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from controller.bench_loop import drive
-from controller.bench_scenarios import Scenario as SmallScenario
+from controller.bench.loop import drive
+from controller.bench.scenarios import Scenario as SmallScenario
 from controller.nmpc import DRIVE_MODEL, Nmpc, NmpcOptions, NmpcOutput
-from controller.obstacles import Obstacle
-from controller.planner_options import PlannerOptions
+from controller.planning.obstacles import Obstacle
+from controller.planning.options import PlannerOptions
+from controller.planning.reference import ReferencePath
 from controller.problem import SINGLE_TRACK, SINGLE_TRACK_LAG, Array, Model, OcpOptions
-from controller.reference import ReferencePath
 from controller.solver import Solver, SolveStatus
 from controller.solvers import make_solver
 from dbc.catalogue import load

@@ -341,8 +341,8 @@ def bench_solver(
     as_json: JsonOption = False,
 ) -> None:
     """Solve time of every solver, interleaved problem by problem in one process on one core, beside its targets."""
-    from controller import bench as solver_bench  # noqa: PLC0415
-    from controller.bench_table import to_table  # noqa: PLC0415
+    from controller.bench import run as solver_bench  # noqa: PLC0415
+    from controller.bench.table import to_table  # noqa: PLC0415
 
     chosen = solver_bench.SETS if sets == "all" else (sets,)
     options = solver_bench.BenchOptions(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from controller.reference import ReferencePath
+from controller.planning.reference import ReferencePath
 from dbc.vehicle import Vehicle
 from gateway.telemetry import Lane
 

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from controller.reference import ReferencePath
+from controller.planning.reference import ReferencePath
 from dbc.errors import UserMistake
 from dbc.vehicle import Vehicle
 from gateway.telemetry import Lane, SceneSample

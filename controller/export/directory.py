@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from controller.bench_library import describe_library, describe_machine
+from controller.bench.library import describe_library, describe_machine
 from controller.build import Build
 from controller.export.targets import TARGETS, TargetName
 from controller.export.vectors import Vector, record, write_vectors

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from controller.bench_loop import drive
-from controller.bench_scenarios import Case, active_cases, nominal_cases
-from controller.bench_sets import HARD_KINDS, Instance, RecordingSolver, hard
+from controller.bench.loop import drive
+from controller.bench.scenarios import Case, active_cases, nominal_cases
+from controller.bench.sets import HARD_KINDS, Instance, RecordingSolver, hard
 from controller.build import Build
 from controller.nmpc import Nmpc
 from controller.problem import Array, OcpOptions

@@ -5,9 +5,9 @@ import pytest
 
 from controller.build import build
 from controller.compiled import CompiledBackEnd
-from controller.planner import Planner, PlannerOptions
+from controller.planning.planner import Planner, PlannerOptions
+from controller.planning.reference import ReferencePath
 from controller.problem import Horizon, OcpOptions
-from controller.reference import ReferencePath
 from controller.solver import SqpSolver
 from dbc.vehicle import load_vehicle
 

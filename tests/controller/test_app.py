@@ -9,9 +9,9 @@ import pytest
 from controller.app import ControlCycle, ControllerOptions, run
 from controller.objects import report_of
 from controller.parameters import ParameterStore
-from controller.planner_options import PlannerOptions
+from controller.planning.options import PlannerOptions
+from controller.planning.reference import ReferencePathError
 from controller.problem import OcpOptions
-from controller.reference import ReferencePathError
 from dbc.vehicle import FOCUS
 from gateway.channel import Channel
 from gateway.messages import CommandStatus, ControlCommand, Mode, VehicleState

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from controller.bench_loop import drive
-from controller.bench_scenarios import Scenario, nominal_scenarios
+from controller.bench.loop import drive
+from controller.bench.scenarios import Scenario, nominal_scenarios
 from controller.disturbance import DisturbanceOptions
 from controller.nmpc import DRIVE_MODEL, Nmpc, NmpcOptions
-from controller.obstacles import Obstacle
-from controller.planner_options import PlannerOptions
+from controller.planning.obstacles import Obstacle
+from controller.planning.options import PlannerOptions
 from controller.problem import SINGLE_TRACK, SINGLE_TRACK_LAG, OcpOptions
 from controller.samples import command_sample, plan_sample
 from controller.solver import Effort, SolveResult, SolveStatus, WarmStart

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from controller.nmpc import Nmpc
 from controller.parameters import HISTORY_LENGTH, Accepted, ParameterStore, Refused, table
-from controller.planner_options import PlannerOptions
+from controller.planning.options import PlannerOptions
 from controller.problem import SINGLE_TRACK_LAG, OcpOptions
 from controller.solvers import make_solver
 from gateway.messages import PLAN_PERIOD_NS, CommandStatus, Mode, VehicleState

@@ -9,7 +9,7 @@ import pytest
 
 from controller.nmpc import Nmpc
 from controller.parameters import ParameterStore
-from controller.planner_options import PlannerOptions
+from controller.planning.options import PlannerOptions
 from controller.problem import OcpOptions
 from controller.samples import PROFILE_PERIOD_NS, UNKNOWN, Circumstances, ProfileMeter, command_sample, parameters_sample
 from controller.solver import Effort, SubFunction

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from controller.ocp import transcribe
-from controller.planner import Planner, PlannerOptions
+from controller.planning.planner import Planner, PlannerOptions
 from controller.problem import Horizon, OcpOptions, pack_constraint_bounds, pack_parameters, pack_variable_bounds
 from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import PROFILE_PARTS, SolveStatus

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from controller.parameters import Accepted, ParameterStore, Refused
-from controller.planner_options import PlannerOptions
+from controller.planning.options import PlannerOptions
 from controller.problem import OcpOptions
 from controller.tuning import (
     SERVICE,

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from controller.nmpc import DRIVE_MODEL
+from controller.planning.reference import ReferencePath
 from controller.problem import OcpOptions
-from controller.reference import ReferencePath
 from controller.solvers import make_solver
 from dbc.catalogue import load
 from dbc.vehicle import load_vehicle

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from controller.parameters import ParameterStore
-from controller.planner_options import PlannerOptions
+from controller.planning.options import PlannerOptions
 from controller.problem import OcpOptions
 from controller.samples import parameters_sample
 from controller.tuning import SERVICE, TuningService

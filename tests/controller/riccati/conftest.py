@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from controller.bench_loop import drive
-from controller.bench_scenarios import nominal_scenarios
-from controller.bench_sets import RecordingSolver
+from controller.bench.loop import drive
+from controller.bench.scenarios import nominal_scenarios
+from controller.bench.sets import RecordingSolver
 from controller.build import find_compiler
 from controller.compiled import CompiledBackEnd
 from controller.nmpc import Nmpc

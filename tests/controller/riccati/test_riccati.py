@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from controller.compiled import CompiledBackEnd
-from controller.planner import Planner, PlannerOptions
+from controller.planning.planner import Planner, PlannerOptions
 from controller.problem import Horizon, OcpOptions
 from controller.riccati.build import C_SOURCES, FLAGS, SCALAR, build_riccati, host_flags
 from controller.riccati.solver import PARTS, RiccatiBackEnd, RiccatiSolver, row_residuals
