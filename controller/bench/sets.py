@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from controller.bench.loop import drive
 from controller.bench.scenarios import Case, active_cases, nominal_cases
 from controller.nmpc import Nmpc
-from controller.problem import Array, Horizon, OcpOptions, pack_constraint_bounds, pack_parameters, pack_variable_bounds
+from controller.problem import N_CAR_STATES, Array, Horizon, OcpOptions, pack_constraint_bounds, pack_parameters, pack_variable_bounds
 from controller.solver import NlpBuffers, Solver, SolveResult, SolveStatus, WarmStart
 from controller.solvers import make_solver
 from dbc.vehicle import Vehicle
@@ -189,7 +189,7 @@ def _start(kind: str, base: Instance, rng: np.random.Generator) -> Instance:
         case "cold":
             warm_start = None
         case "kicked":
-            state += rng.standard_normal(6) * (1.0, 0.3, 0.15, 0.3, 0.3, 0.08)
+            state[:N_CAR_STATES] += rng.standard_normal(N_CAR_STATES) * (1.0, 0.3, 0.15, 0.3, 0.3, 0.08)
         case "infeasible":
             side = rng.choice((-1.0, 1.0))
             edge_m = base.horizon.left_m[0] if side > 0.0 else base.horizon.right_m[0]
@@ -198,7 +198,7 @@ def _start(kind: str, base: Instance, rng: np.random.Generator) -> Instance:
             state[3:5] += normal * (lateral_m - normal @ (state[3:5] - base.horizon.reference[0, 3:5]))
             warm_start = None
         case _:
-            state += rng.uniform(-1.0, 1.0, 6) * (3.0, 1.0, 0.6, 1.5, 1.5, 0.4)
+            state[:N_CAR_STATES] += rng.uniform(-1.0, 1.0, N_CAR_STATES) * (3.0, 1.0, 0.6, 1.5, 1.5, 0.4)
             previous_input = rng.uniform((-0.55, -1.0), (0.55, 1.0))
             warm_start = warm_start if rng.random() < 0.5 else None
     return Instance(state, previous_input, base.horizon, warm_start, kind)

@@ -17,6 +17,7 @@ from controller.bench.library import describe_library, describe_machine
 from controller.build import Build
 from controller.export.targets import TARGETS, TargetName
 from controller.export.vectors import Vector, record, write_vectors
+from controller.nmpc import DRIVE_MODEL
 from controller.problem import OcpOptions
 from controller.riccati.build import FLAGS, build_riccati, host_flags, write_sources
 from controller.riccati.emit import SIZES_NAME
@@ -70,9 +71,8 @@ def export(
             raise ExportError(f"{directory}: is not empty; name a new or an empty directory")
         # Made inside, and moved to its place when whole.
         with tempfile.TemporaryDirectory(dir=directory, prefix="making-") as made:
-            vectors = _write(
-                Path(made), vehicle, options or OcpOptions(), target=target, progress=progress, vectors_per_set=vectors_per_set
-            )
+            ocp = options or OcpOptions(model=DRIVE_MODEL)
+            vectors = _write(Path(made), vehicle, ocp, target=target, progress=progress, vectors_per_set=vectors_per_set)
             for path in Path(made).iterdir():
                 path.rename(directory / path.name)
     except OSError as error:

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from controller.build import METADATA_NAME, Build
 from controller.export.targets import TARGETS, TargetName, find_toolchain
+from controller.nmpc import DRIVE_MODEL
 from controller.problem import OcpOptions
 from controller.riccati.build import build_riccati
 from controller.solvers import DEFAULT_SOLVER, LIBRARIES
@@ -34,7 +35,7 @@ def build_for(target: TargetName, vehicle_path: Path, progress: Progress) -> dic
         UserMistake: the vehicle file cannot be used.
         BuildError: there is no compiler for the target, or it refuses.
     """
-    car, options = load_vehicle(vehicle_path).model, OcpOptions()
+    car, options = load_vehicle(vehicle_path).model, OcpOptions(model=DRIVE_MODEL)
     if target is TargetName.HOST:
         return describe(DEFAULT_SOLVER, target, LIBRARIES[DEFAULT_SOLVER](car, options, progress))
     compiler, flags = find_toolchain(target)

@@ -13,8 +13,7 @@
  * Newton's method, 1993.)
  *
  * On one set of pieces e := m is a linear fixed-point iteration, slow where a combination of active rows is nearly out of reach of the
- * inputs. So two of them are extrapolated to where the correction m - e is smallest (Anderson, Iterative procedures for nonlinear
- * integral equations, 1965, with depth one), and when that does not help, the weight grows (Bertsekas, chapter 2).
+ * inputs, as those of a corridor whose edge the car follows. Where it is slow, the weight grows (Bertsekas, chapter 2).
  */
 #include <math.h>
 #include <string.h>
@@ -33,7 +32,6 @@
 #define MAX_FACTORIZATIONS 30
 #define MAX_SOLUTIONS 90
 #define SHARE_STEP 0.25        /* of the exact Hessian, given up when a pivot has no descent */
-#define LARGEST_EXTRAPOLATION 1e3
 
 #define LINE_SEARCH_START 0.1  /* search only when the slope at the full step is positive and above this part of that at zero */
 #define LINE_SEARCH_END 0.05
@@ -96,11 +94,9 @@ static void start(const problem_data *p, const iterate *at, const row_array row_
         const lane_bits is_active = lanes_abs(multiplier) > ACTIVE_MULTIPLIER;
         AT(qp->estimate, i) = lanes_select(is_active, multiplier, zero);
         AT(qp->value, i) = lanes_select(is_active, beyond, inside);
-        AT(qp->last_multiplier, i) = AT(qp->last_correction, i) = zero;
     }
     find_pieces(p, row_value, qp);
     qp->violation = INFINITY;
-    qp->has_last = false;
 }
 
 /* Last stage at which two arrays of rows differ; -1 when they are the same. */
@@ -260,34 +256,11 @@ static double largest_violation(const active_set *qp)
     return largest / qp->weight;
 }
 
-/* How far to go on beyond e := m, in changes of m since the last estimates. */
-static double extrapolation(const active_set *qp)
-{
-    double along = 0.0, size = 0.0;
-    for (int n = 0; n < qp->n_engaged; n++) {
-        const int i = qp->engaged[n];
-        const double correction = qp->multiplier[i] - qp->estimate[i], change = correction - qp->last_correction[i];
-        along -= correction * change;
-        size += change * change;
-    }
-    return along > 0.0 ? fmin(along / size, LARGEST_EXTRAPOLATION) : 0.0;
-}
-
-/* Where the violation has not become much smaller, with a larger weight from now on. */
+/* e := m, and a larger weight from now on where the violation has not become much smaller. */
 static void update_estimates(const problem_data *p, const row_array row_value, double violation, active_set *qp)
 {
-    const double beyond = qp->has_last ? extrapolation(qp) : 0.0;
-    for (int n = 0; n < qp->n_engaged; n++) {
-        const int i = qp->engaged[n];
-        const double multiplier = qp->multiplier[i];
-        const double change = qp->has_last ? multiplier - qp->last_multiplier[i] : 0.0;
-        qp->last_correction[i] = multiplier - qp->estimate[i];
-        qp->last_multiplier[i] = multiplier;
-        qp->estimate[i] = multiplier + beyond * change;
-    }
-    const bool is_slow = violation > GOOD_DECREASE * qp->violation && qp->weight < LARGEST_WEIGHT;
-    if (is_slow) qp->weight *= WEIGHT_GROWTH;
-    qp->has_last = !is_slow;
+    memcpy(qp->estimate, qp->multiplier, sizeof qp->estimate);
+    if (violation > GOOD_DECREASE * qp->violation && qp->weight < LARGEST_WEIGHT) qp->weight *= WEIGHT_GROWTH;
     qp->violation = violation;
     find_pieces(p, row_value, qp);
 }
@@ -310,10 +283,7 @@ bool quadratic_program(nmpc_solver *s, bool is_same_hessian)
         const double fraction = i == 0 ? 1.0 : exact_line_search(s);
         const bool is_minimum = fraction == 1.0 && is_foretold(qp);
         move(s, fraction, qp);
-        if (!is_minimum) {
-            qp->has_last = false;
-            continue;
-        }
+        if (!is_minimum) continue;
         const double violation = largest_violation(qp);
         if (violation < LARGEST_VIOLATION || ++estimates == MAX_ESTIMATES) break;
         update_estimates(&s->problem, s->model.row_value, violation, qp);

@@ -33,7 +33,7 @@ static void add_corridor_weight(const double normal[2], double weight, square ma
     matrix[Y][Y] += weight * normal[1] * normal[1];
 }
 
-/* M = H + W' P W. The columns of J that belong to X and Y are those of the identity: the model does not know where it is. */
+/* M = H + W' P W. */
 static void stage_matrix(const problem_data *p, const linearization *model, const riccati *kkt, int k, square M)
 {
     const stage_row *J = model->jacobian[k], *H = model->hessian[k], *P = kkt->value_hessian[k + 1];
@@ -45,8 +45,8 @@ static void stage_matrix(const problem_data *p, const linearization *model, cons
     }
     for (int i = 0; i < NZ; i++) {
         stage_vector sum = scaled(kkt->exact_share, H[i]);
-        if (i >= NX || i == X || i == Y) sum = plus(sum, 1.0, PW[i]);
-        for (int l = 0; l < NX && i != X && i != Y; l++) sum = plus(sum, J[l][i], PW[l]);
+        if (i >= NX) sum = plus(sum, 1.0, PW[i]);
+        for (int l = 0; l < NX; l++) sum = plus(sum, J[l][i], PW[l]);
         store(M[i], sum);
     }
     const double *weight = &kkt->row_weight[k * STAGE_ROWS];

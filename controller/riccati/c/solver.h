@@ -78,8 +78,6 @@ typedef struct {
     row_array multiplier;                /* m(c) at the value */
     row_array slope, intercept;          /* of the piece of m that it lies on; the intercept where the iterate is, without a step */
     row_array foretold;                  /* multiplier at the Newton point, by the pieces before */
-    row_array last_multiplier, last_correction; /* at the estimates before, on the same pieces */
-    bool has_last;
     double weight, violation;            /* w; by how much the rows missed their bounds at the estimates before */
     int engaged[ROW_ROOM], n_engaged;    /* rows that are not idle */
 } active_set;

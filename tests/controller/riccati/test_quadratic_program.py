@@ -91,7 +91,7 @@ def library(sizes, load_c, tmp_path_factory):
 
 
 def random_problem(sizes, seed):
-    """Stable-ish dynamics that know no position, positive definite Hessians, no bounds."""
+    """Stable-ish dynamics, positive definite Hessians, no bounds."""
     rng = np.random.default_rng(seed)
     p = np.zeros((), sizes.problem)
     angle = rng.uniform(-3, 3, sizes.N)
@@ -104,11 +104,7 @@ def random_problem(sizes, seed):
     p["linear"][(sizes.stage_rows * np.arange(sizes.N)[:, None] + np.arange(sizes.NU)).ravel()] = np.inf
     p["z"] = rng.standard_normal(p["z"].shape)
     p["jacobian"] = 0.5 * rng.standard_normal(p["jacobian"].shape)
-    p["jacobian"][:, :, sizes.position] = 0.0
-    for component in sizes.position:
-        p["jacobian"][:, component, component] = 1.0
     root = 0.5 * rng.standard_normal((sizes.N, sizes.n_stage, sizes.n_stage))
-    root[:, sizes.position] = 0.0
     p["hessian"] = root @ root.transpose(0, 2, 1)
     p["gap"] = rng.standard_normal(p["gap"].shape)
     p["gradient"] = 5.0 * rng.standard_normal(p["gradient"].shape)
@@ -237,8 +233,8 @@ def test_the_same_problem_again_needs_no_factorization(library, sizes):
 
 
 def test_nearly_dependent_rows_need_few_estimates(library, sizes):
-    """Corridor and terminal bound on Y differ by a thousandth of X: with e := m alone, each of ten estimates gains next to nothing."""
-    problem, eps = random_problem(sizes, 2), 1e-3
+    """Corridor and terminal bound on Y differ by a fiftieth of X: with the first weight alone, ten estimates would not do."""
+    problem, eps = random_problem(sizes, 2), 2e-2
     problem["normal"][sizes.N] = np.sin(eps), np.cos(eps)
     problem["row_value"][-1] = 0.0
     last_y, corridor = sizes.rows - 1 - sizes.NX + sizes.position[1], sizes.rows - 1
@@ -250,13 +246,12 @@ def test_nearly_dependent_rows_need_few_estimates(library, sizes):
         problem["lower"][row] = problem["upper"][row] = value
     answer = solve(library, sizes, problem)
     assert_optimal(sizes, problem, answer)
-    assert answer["solutions"] <= 10
+    assert answer["solutions"] <= 11
 
 
 def test_a_hessian_without_descent_is_made_convex(library, sizes):
     problem = random_problem(sizes, 1)
-    inner = [i for i in range(sizes.n_stage) if i not in sizes.position]
-    problem["hessian"][:, inner, inner] -= 25.0
+    problem["hessian"] -= 25.0 * np.eye(sizes.n_stage)
     answer = solve(library, sizes, problem)
     assert answer["is_solved"]
     assert 0.0 <= answer["share"] < 1.0
