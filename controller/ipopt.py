@@ -13,8 +13,7 @@ from controller.integrator import Expression
 from controller.interpreted import InterpretedBackEnd
 from controller.ocp import OcpFunctions, advance_function, kkt_function, transcribe
 from controller.problem import OcpOptions
-from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC
-from controller.soft import SoftSolver
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC, SoftSolver
 from controller.solver import Effort
 from dbc.vehicle import ModelParameters
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from controller.bench.sets import Instance, beyond_bounds, pack_instance
 from controller.compiled import CompiledBackEnd
 from controller.problem import Array, OcpOptions, full_reference
-from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import DUAL_TOLERANCE, PRIMAL_TOLERANCE, NlpBuffers, SolveResult, WarmStart
 
 

@@ -14,7 +14,8 @@ from controller.bench.sets import HARD_KINDS, Instance, RecordingSolver, hard
 from controller.build import Build
 from controller.nmpc import Nmpc
 from controller.problem import Array, OcpOptions
-from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC, RiccatiBackEnd, RiccatiSolver
+from controller.riccati.solver import RiccatiBackEnd, RiccatiSolver
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import Effort, NlpBuffers, SqpSolver
 from dbc.errors import SetupFailure
 from dbc.vehicle import Vehicle

@@ -15,7 +15,7 @@ import pytest
 from controller.ocp import transcribe
 from controller.planning.planner import Planner, PlannerOptions
 from controller.problem import Horizon, OcpOptions, pack_constraint_bounds, pack_parameters, pack_variable_bounds
-from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import PROFILE_PARTS, SolveStatus
 from controller.solvers import LIBRARIES, SOLVERS, make_solver
 from tests.support.kinematic import kinematic_options

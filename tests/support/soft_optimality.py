@@ -4,7 +4,7 @@ import casadi as ca
 import numpy as np
 
 from controller.ocp import transcribe
-from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 
 
 def conditions_of(car, options):

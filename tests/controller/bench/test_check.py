@@ -13,7 +13,7 @@ from controller.bench.hard import HardRun, longest_quiet_us, run_hard
 from controller.bench.sets import Instance, hard
 from controller.ocp import transcribe
 from controller.problem import OcpOptions, pack_parameters
-from controller.riccati.solver import PENALTY_LINEAR, PENALTY_QUADRATIC
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import Effort, SolveResult, SolveStatus, WarmStart
 from controller.solvers import make_solver
 

@@ -12,7 +12,8 @@ from controller.compiled import CompiledBackEnd
 from controller.planning.planner import Planner, PlannerOptions
 from controller.problem import Horizon, OcpOptions
 from controller.riccati.build import C_SOURCES, FLAGS, SCALAR, build_riccati, host_flags
-from controller.riccati.solver import PARTS, RiccatiBackEnd, RiccatiSolver, row_residuals
+from controller.riccati.solver import PARTS, RiccatiBackEnd, RiccatiSolver
+from controller.soft import row_residuals
 from controller.solver import PROFILE_PARTS, NlpBuffers, SolverError, SolveStatus, SqpSolver
 from tests.support.soft_optimality import conditions_of, is_optimal
 
