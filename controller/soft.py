@@ -1,6 +1,5 @@
 """The shell of solvers that take state bounds, terminal box and corridor as soft: it checks the conditions of the soft programme."""
 
-import math
 import time
 from collections.abc import Callable
 
@@ -37,16 +36,8 @@ class SoftSolver(SqpSolver):
         self._is_hard[layout.state_index[0]] = self._is_hard[layout.input_index] = True
         self._is_hard[layout.n_variables : layout.n_variables + layout.n_gaps] = True
 
-    def _residuals(self) -> tuple[float, float]:
-        """Primal and dual residual of the answer to the soft programme; NaN when any number in it is not finite."""
-        b = self._buffers
-        self._back_end.check()
-        if not all(np.isfinite(part).all() for part in (b.w, b.lam_w, b.lam_g, b.g, b.gradient)):
-            return math.nan, math.nan
-        values, multipliers = np.concatenate((b.w, b.g)), np.concatenate((b.lam_w, b.lam_g))
-        lower, upper = np.concatenate((b.lower_w, b.lower_g)), np.concatenate((b.upper_w, b.upper_g))
-        primal, dual = row_residuals(values, multipliers, lower, upper, self._is_hard)
-        return primal, max(dual, float(np.max(np.abs(b.gradient + b.lam_w))))
+    def _row_residuals(self, values: Array, multipliers: Array, lower: Array, upper: Array) -> tuple[float, float]:
+        return row_residuals(values, multipliers, lower, upper, self._is_hard)
 
 
 def row_residuals(values: Array, multipliers: Array, lower: Array, upper: Array, is_hard: NDArray[np.bool_]) -> tuple[float, float]:

@@ -291,9 +291,12 @@ class SqpSolver:
             return math.nan, math.nan
         values, multipliers = np.concatenate((b.w, b.g)), np.concatenate((b.lam_w, b.lam_g))
         lower, upper = np.concatenate((b.lower_w, b.lower_g)), np.concatenate((b.upper_w, b.upper_g))
+        primal, dual = self._row_residuals(values, multipliers, lower, upper)
+        return primal, max(dual, float(np.max(np.abs(b.gradient + b.lam_w))))
+
+    def _row_residuals(self, values: Array, multipliers: Array, lower: Array, upper: Array) -> tuple[float, float]:
+        """Largest violation, and largest violation of complementarity, of variables and constraints under their bounds."""
         violation = float(np.max(np.maximum(lower - values, values - upper)))
-        stationarity = float(np.max(np.abs(b.gradient + b.lam_w)))
         # A multiplier above zero belongs to the upper bound, below zero to the lower: it must be zero away from its bound.
         distance = np.where(multipliers > 0.0, upper - values, values - lower)
-        complementarity = float(np.max(np.minimum(np.abs(multipliers), np.abs(distance))))
-        return max(violation, 0.0), max(stationarity, complementarity)
+        return max(violation, 0.0), float(np.max(np.minimum(np.abs(multipliers), np.abs(distance))))
