@@ -121,7 +121,7 @@ def _run(setup: RunSetup, options: DriveOptions, display: Display) -> Verdict:
         recording = Recording(time.monotonic_ns())
         interruption = RealtimeRun(setup, recording, display.announce, display.progress).drive()
     verdict = evaluate(recording, setup.scenario, setup.vehicle, setup.stage, interruption)
-    summary = build_summary(_facts(setup, options, started, time.monotonic() - start_s), verdict)
+    summary = build_summary(_facts(setup, options, started, time.monotonic() - start_s), verdict, recording.samples("parameters"))
     (setup.directory / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     write_report(setup.directory / "report.html", summary, recording, setup.scenario, setup.vehicle, verdict)
     print(f"{'PASS' if verdict.passed else 'FAIL'}  {verdict.reason}")

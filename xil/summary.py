@@ -4,13 +4,16 @@ import hashlib
 import os
 import platform
 import subprocess
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from gateway.telemetry import Sample
 from xil.metrics import Metric, Verdict
 from xil.scenario import Scenario, Stage
 
@@ -45,10 +48,13 @@ class RunFacts:
     files: Mapping[str, Path]
 
 
-def build_summary(facts: RunFacts, verdict: Verdict) -> dict[str, Any]:
+def build_summary(facts: RunFacts, verdict: Verdict, parameter_changes: Sequence[Sample]) -> dict[str, Any]:
     """The content of `summary.json`, made of what JSON can carry.
 
     `metrics` are what a seed determines in lockstep, `timing` what the machine determines; both are judged.
+
+    Args:
+        parameter_changes: samples of the topic `parameters`: what somebody tuned while it drove.
 
     Raises:
         OSError: a file of the run cannot be read.
@@ -68,6 +74,7 @@ def build_summary(facts: RunFacts, verdict: Verdict) -> dict[str, Any]:
         "compiler": facts.compiler,
         "machine": machine(),
         "sha256": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in facts.files.items()},
+        "parameter_changes": [msgspec.to_builtins(change) for change in parameter_changes],
         "metrics": _as_data(verdict.metrics),
         "timing": _as_data(verdict.timing),
     }

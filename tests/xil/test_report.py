@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from dbc.vehicle import FOCUS, load_vehicle
+from gateway.telemetry import ParameterChange, ParametersSample
 from tests.support.recorded_drive import RecordedDrive
 from xil.metrics import evaluate
 from xil.report import write_report
@@ -48,13 +49,13 @@ class Page(HTMLParser):
             self.texts.setdefault(self.open[-1], []).append(data)
 
 
-def run(folder: Path, name: str = "iso3888-1", stage: Stage = Stage.HIL, **spoiled):
+def run(folder: Path, name: str = "iso3888-1", stage: Stage = Stage.HIL, changes=(), **spoiled):
     scenario = load_scenario(name)
     recording = RecordedDrive(scenario, VEHICLE, **spoiled).recording
     verdict = evaluate(recording, scenario, VEHICLE, stage)
     files = {"vehicle": FOCUS, "scenario": SCENARIO_FOLDER / f"{name}.toml"}
     started = datetime(2026, 5, 4, 12, 30, tzinfo=UTC)
-    summary = build_summary(RunFacts(scenario, stage, 7, "casadi-c", started, 21.5, "gcc 12.2", files), verdict)
+    summary = build_summary(RunFacts(scenario, stage, 7, "casadi-c", started, 21.5, "gcc 12.2", files), verdict, changes)
     path = folder / "report.html"
     write_report(path, summary, recording, scenario, VEHICLE, verdict)
     return summary, path.read_text(encoding="utf-8")
@@ -152,6 +153,16 @@ def test_summary_is_json_and_complete(passed):
     assert set(summary["versions"]) == {"xilgate", "python", "casadi", "cantools", "python-can", "zenoh", "numpy"}
     assert summary["sha256"]["vehicle"] == hashlib.sha256(FOCUS.read_bytes()).hexdigest()
     assert all(set(m) == {"name", "value", "unit", "relation", "limit", "passed"} for m in summary["metrics"] + summary["timing"])
+
+
+def test_who_tunes_while_it_drives_is_told_of(tmp_path, passed):
+    change = ParameterChange(name="planner.safe_time_s", old=1.8, new=1.2)
+    sample = ParametersSample(t_ns=5, seq=1, version=1, accepted_ns=4, who="me", changes=[change], reverts=[])
+    summary, content = run(tmp_path, changes=[sample])
+    (told,) = summary["parameter_changes"]
+    assert (told["who"], told["changes"]) == ("me", [{"name": "planner.safe_time_s", "old": 1.8, "new": 1.2}])
+    assert "tuned while driving" in content
+    assert "tuned while driving" not in passed[1]
 
 
 def test_two_lockstep_runs_have_the_same_metrics(tmp_path):
