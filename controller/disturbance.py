@@ -28,14 +28,17 @@ class DisturbanceOptions:
         time_constant_s: of the double pole [s]. With the noise of the navigation system, 0.014 m/s, d then has 0.003 m/s2 of noise.
         largest_error_mps: of the predicted speed [m/s]; with a larger one something else has happened, and the observer begins anew.
         largest_mps2: bound on d; a slope of 25 %.
-        slowest_mps: speed below which d stays as it is and the speed is taken as measured unless the car is driven: it may stand,
+        slowest_mps: speed below which nothing is learnt and the speed is taken as measured unless the car is driven: it may stand,
             which the model cannot. Driven and standing, as on a slope that is steeper than known, it has to learn, or it stands there.
+        leak_s: time constant with which a push (d above 0) is forgotten there [s]: believed where there is none, it would make
+            the controller brake a car that is to start, for ever.
     """
 
     time_constant_s: float = 0.6
     largest_error_mps: float = 1.0
     largest_mps2: float = 2.5
     slowest_mps: float = 1.0
+    leak_s: float = 3.0
 
 
 def equivalent_drive(disturbance_mps2: float, car: ModelParameters) -> float:
@@ -57,8 +60,12 @@ class DisturbanceObserver:
         self.disturbance_mps2 = 0.0
 
     def restart(self, measured_mps: float) -> None:
-        """Someone else drives, with what is unknown: the speed is what is measured, d stays."""
+        """The speed is what is measured, d stays."""
         self.speed_mps = measured_mps
+
+    def forget(self) -> None:
+        """Someone else has driven, maybe to another slope, or held the car against the engine: d is not known."""
+        self.disturbance_mps2 = 0.0
 
     def update(self, predicted_mps: float, measured_mps: float, elapsed_s: float, drive_norm: float) -> None:
         """Take one measurement.
@@ -69,7 +76,11 @@ class DisturbanceObserver:
         """
         options = self._options
         error_mps = measured_mps - predicted_mps
-        if abs(error_mps) > options.largest_error_mps or (measured_mps < options.slowest_mps and drive_norm <= 0.0):
+        if measured_mps < options.slowest_mps and drive_norm <= 0.0:
+            self.restart(measured_mps)
+            self.disturbance_mps2 *= math.exp(-elapsed_s / options.leak_s) if self.disturbance_mps2 > 0.0 else 1.0
+            return
+        if abs(error_mps) > options.largest_error_mps:
             self.restart(measured_mps)
             return
         pole = math.exp(-elapsed_s / options.time_constant_s)

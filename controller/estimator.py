@@ -67,6 +67,13 @@ class StateEstimator:
 
     def restart(self, measured: Array, acting: Array, t_ns: int) -> None:
         """Someone else has driven until now; `acting` is what acts. Otherwise as `observe`."""
+        if self._observer is not None:
+            self._observer.forget()
+            self.input_shift = np.zeros(2)
+        self.hold(measured, acting, t_ns)
+
+    def hold(self, measured: Array, acting: Array, t_ns: int) -> None:
+        """The car has been held where it is, with `acting`; what disturbs it is still there. Otherwise as `observe`."""
         self._compensator.restart(acting)
         self._begin(measured, acting, t_ns)
 

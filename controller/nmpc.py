@@ -31,6 +31,8 @@ _HOLD_DRIVE_NORM = -1.0
 """Brake that holds a standing car, on slopes up to 30 %: as the gateway's own after a safe stop."""
 _HOLD_RATE_PER_S = 2.0
 """Rate at which it is pressed: the car stands, there is no hurry."""
+_RELEASE_CYCLES = 8
+"""Cycles in a row that must ask for motion before the brake is released: noise on a standing object must not saw at it."""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,7 @@ class Nmpc:
         self._seq = 0
         self._solved_ns: int | None = None
         self._is_holding = False
+        self._asked_cycles = 0
         self._last_drive_norm = 0.0
         self._yaw_rad = 0.0
         self._nothing_planned = Plan(0, np.zeros((HORIZON_STEPS + 1, ocp.model.n_states)), np.zeros((HORIZON_STEPS, ocp.model.n_inputs)))
@@ -143,12 +146,11 @@ class Nmpc:
             return self._answer(state, now_ns, None)
         self._observe(state, measured, acting)
         start = self._estimator.predict(now_ns)
-        elapsed_s = 0.0 if self._solved_ns is None else (now_ns - self._solved_ns) * 1e-9
+        elapsed_s = 0.0 if self._solved_ns is None else max(0, now_ns - self._solved_ns) * 1e-9
         horizon = self._planner.horizon(start[:N_CAR_STATES], elapsed_s, objects)
         result = self._solve(start, horizon, now_ns)
         self._solved_ns, self._yaw_rad = now_ns, float(measured[5])
-        stands = abs(measured[0]) < _STANDSTILL_MPS or self._is_holding
-        self._is_holding = bool(stands and state.mode is Mode.ENGAGED and not horizon.reference[:, 0].any())
+        self._decide_hold(state, horizon)
         return self._answer(state, now_ns, Solution(start, horizon, result))
 
     def _apply_tuning(self) -> None:
@@ -162,9 +164,17 @@ class Nmpc:
             self._estimator.restart(measured, acting, state.t_ns)
             self._planner.reset()
         elif self._is_holding:  # in the model a brake drives a standing car backwards
-            self._estimator.restart(measured, acting * (1.0, 0.0), state.t_ns)
+            self._estimator.hold(measured, acting * (1.0, 0.0), state.t_ns)
         else:
             self._estimator.observe(measured, acting, state.t_ns)
+
+    def _decide_hold(self, state: VehicleState, horizon: Horizon) -> None:
+        """Hold a car that is to stand; release it when motion has been asked for in every cycle of a while."""
+        self._asked_cycles = self._asked_cycles + 1 if horizon.reference[:, 0].any() else 0
+        if state.mode is not Mode.ENGAGED or self._asked_cycles >= _RELEASE_CYCLES:
+            self._is_holding = False
+        elif self._asked_cycles == 0 and abs(state.vx_mps) < _STANDSTILL_MPS:
+            self._is_holding = True
 
     def _solve(self, start: Array, horizon: Horizon, now_ns: int) -> SolveResult:
         self._solver.options = self._shifted_options()
@@ -184,7 +194,7 @@ class Nmpc:
         return replace(self._ocp, input_bounds=bounds)
 
     def _commanded(self, now_ns: int, result: SolveResult) -> Plan:
-        """The plan as commands: without the disturbance, within the bounds; a car that is to stand is held."""
+        """The plan as commands: without the disturbance, within the bounds; a car that is to stand is held, whatever they are."""
         inputs = np.clip(result.inputs - self._estimator.input_shift, *np.transpose(self._ocp.input_bounds))
         if self._is_holding:
             pressed = self._last_drive_norm - _HOLD_RATE_PER_S * 1e-9 * PLAN_PERIOD_NS * np.arange(1, HORIZON_STEPS + 1)

@@ -135,10 +135,11 @@ def values_table(answer: Values) -> Table:
     return table
 
 
-def changes_table(answer: Accepted) -> Table:
+def changes_table(answer: Accepted) -> Table | Text:
     """What a request changed."""
-    title = f"parameters, version {answer.version}" + ("" if answer.changes else ": nothing to change")
-    table = _table(title, "name", "old", "new")
+    if not answer.changes:
+        return Text(f"parameters, version {answer.version}: nothing to change")
+    table = _table(f"parameters, version {answer.version}", "name", "old", "new")
     _add_changes(table, answer.changes)
     return table
 

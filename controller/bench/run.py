@@ -65,6 +65,8 @@ class BenchOptions:
         for name in self.solvers:
             if name not in SOLVERS:
                 raise UserMistake(f"solver {name!r}: there are {', '.join(SOLVERS)}")
+            if name in NOT_TIMED:
+                raise UserMistake(f"solver {name!r} is never timed; --agreement compares its answers")
 
     @property
     def timed(self) -> list[str]:

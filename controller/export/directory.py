@@ -21,6 +21,7 @@ from controller.nmpc import DRIVE_MODEL
 from controller.problem import OcpOptions
 from controller.riccati.build import FLAGS, build_riccati, host_flags, write_sources
 from controller.riccati.emit import SIZES_NAME
+from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from dbc.errors import UserMistake
 from dbc.vehicle import Vehicle, load_vehicle
 
@@ -142,6 +143,7 @@ def _facts(vehicle: Vehicle, options: OcpOptions, target: TargetName, build: Bui
         "target": target.value,
         "vehicle": vehicle.model.model_dump(),
         "options": asdict(options),
+        "penalties": {"linear": PENALTY_LINEAR, "quadratic": PENALTY_QUADRATIC},
         "sizes": {"variables": layout.n_variables, "constraints": layout.n_constraints, "parameters": layout.n_parameters},
         "exported_on": {"machine": describe_machine(), "sha256": build.sha256, **describe_library("riccati", build)},
         "vectors": [{"name": vector.name, "status": vector.status, "work": vector.effort.work} for vector in vectors],

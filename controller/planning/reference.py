@@ -62,7 +62,9 @@ class ReferencePath:
         """
         try:
             rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
-        except (OSError, UnicodeDecodeError) as error:
+        except OSError as error:
+            raise ReferencePathError(f"{path}: {error.strerror or error}") from error
+        except UnicodeDecodeError as error:
             raise ReferencePathError(f"{path}: {error}") from error
         if not rows or tuple(name.strip() for name in rows[0]) != _COLUMNS:
             raise ReferencePathError(f"{path}: the first line must be {','.join(_COLUMNS)}")

@@ -221,7 +221,7 @@ def ask(source: Source, service: str, request: bytes, base_port: int = DEFAULT_B
     try:
         session = _session([], [f"tcp/127.0.0.1:{port}"], timeout_s)
     except zenoh.ZError as error:
-        raise TelemetryError(f"no {source} answers on telemetry port {port}; name the ports of your run with --telemetry-port") from error
+        raise TelemetryError(f"no {source} on port {port}, of --telemetry-port {base_port}; name the ports of your run") from error
     with session:
         while time.monotonic() < deadline_s:
             for reply in session.get(_service_key(source, service), payload=request, timeout=timeout_s):
@@ -230,7 +230,7 @@ def ask(source: Source, service: str, request: bytes, base_port: int = DEFAULT_B
                 refusal = reply.err.payload.to_string() if reply.err is not None else ""
                 raise TelemetryError(f"{source} on telemetry port {port}, {service}: {refusal}")
             time.sleep(_ASK_PERIOD_S)  # nobody took the request: the process has not declared its service yet
-    raise TelemetryError(f"the {source} on telemetry port {port} serves no {service}")
+    raise TelemetryError(f"port {port}, of --telemetry-port {base_port}, serves no {service}; name the ports of your run")
 
 
 def new_boot_id() -> int:

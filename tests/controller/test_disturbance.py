@@ -78,6 +78,17 @@ def test_a_restart_keeps_what_was_learnt():
     assert (observer.speed_mps, observer.disturbance_mps2) == (3.0, learnt)
 
 
+def test_a_push_that_is_not_there_any_more_does_not_hold_a_standing_car_for_ever():
+    observer = DisturbanceObserver(DisturbanceOptions())
+    observer.disturbance_mps2 = 1.5
+    for _ in range(250):  # 10 s, standing, and the controller brakes because of the push
+        observer.update(0.0, 0.0, 0.04, -0.1)
+    assert 0.0 <= observer.disturbance_mps2 < 0.1
+    observer.disturbance_mps2 = -0.6  # a slope up: needed for the start
+    observer.update(0.0, 0.0, 0.04, -0.1)
+    assert observer.disturbance_mps2 == -0.6
+
+
 def test_the_equivalent_drive_accelerates_the_model_by_the_disturbance(vehicle):
     import casadi as ca  # noqa: PLC0415
 

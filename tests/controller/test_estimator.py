@@ -84,6 +84,11 @@ def test_a_slope_becomes_drive_and_speed_has_no_offset(vehicle, model):
     assert predicted[0] == pytest.approx(state[0] + 0.03 * (0.1 * 1500.0 / 0.31 / 1500.0 + slope_mps2), abs=0.005)
     if model is SINGLE_TRACK_LAG:
         assert predicted[7] == pytest.approx(0.1 + shift[1], abs=0.005)
+    estimator.hold(CAR_STATE, REST, 126 * PERIOD_NS)
+    assert estimator.input_shift[1] == shift[1]  # the slope is still there
+    estimator.restart(CAR_STATE, REST, 127 * PERIOD_NS)
+    assert (estimator.disturbance_mps2, estimator.input_shift[1]) == (0.0, 0.0)  # somebody may have driven elsewhere
+    np.testing.assert_array_equal(estimator.predict(127 * PERIOD_NS)[6:], 0.0)
 
 
 def test_a_disturbance_that_is_still_being_learnt_does_not_touch_the_drive_of_the_commands(vehicle):

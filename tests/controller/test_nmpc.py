@@ -363,8 +363,18 @@ def test_a_car_that_is_held_drives_on_when_the_reference_does(stub, wavy_path, v
     standing = replace(state_on(wavy_path), vx_mps=0.0)
     held = [loop.step(replace(standing, t_ns=k * PERIOD_NS), k * PERIOD_NS, wall).command.drive_norm for k in range(1, 30)]
     assert held[-1] == -1.0
-    gone = [loop.step(replace(standing, t_ns=k * PERIOD_NS), k * PERIOD_NS).command.drive_norm for k in range(30, 40)]
-    assert gone[0] > 0.1
+    flickering = [wall if k % 4 == 0 else () for k in range(60)]
+    flickers = [loop.step(replace(standing, t_ns=k * PERIOD_NS), k * PERIOD_NS, flickering[k]).command.drive_norm for k in range(30, 60)]
+    assert flickers == [-1.0] * 30  # a report that comes and goes must not saw at the brake
+    gone = [loop.step(replace(standing, t_ns=k * PERIOD_NS), k * PERIOD_NS).command.drive_norm for k in range(60, 75)]
+    assert gone[-1] > 0.1
+
+
+def test_time_that_goes_back_is_no_exception(stub, wavy_path, vehicle):
+    loop = Nmpc(stub, wavy_path, vehicle, 1)
+    for k in (50, 51, 1, 2):
+        output = loop.step(replace(state_on(wavy_path), t_ns=k * PERIOD_NS), k * PERIOD_NS)
+        assert math.isfinite(output.command.steer_rad)
 
 
 def test_a_moving_car_is_not_held(stub, wavy_path, vehicle):

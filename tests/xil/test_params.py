@@ -112,7 +112,7 @@ def test_following_tells_what_comes_in_force(controller):
 
 
 def test_without_a_controller_nothing_is_followed():
-    with pytest.raises(TelemetryError, match="no controller answers"):
+    with pytest.raises(TelemetryError, match="no controller on port"):
         params.follow(free_base_port(), threading.Event(), print)
 
 
