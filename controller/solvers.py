@@ -4,12 +4,13 @@ import time
 from collections.abc import Callable
 from functools import partial
 
-from controller.build import Build, build, build_qrqp
+from controller.build import build, build_qrqp
 from controller.compiled import CompiledBackEnd
 from controller.problem import OcpOptions
 from controller.riccati.build import SCALAR, build_riccati
 from controller.riccati.solver import RiccatiSolver
 from controller.solver import Solver, SqpSolver
+from dbc.build import Build
 from dbc.errors import UserMistake
 from dbc.vehicle import ModelParameters
 

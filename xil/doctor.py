@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from controller.build import BuildError, find_compiler
+from dbc.build import BuildError, find_compiler
 from xil.bus import socketcan_problem
 
 _CAN_INTERFACES = ("vcan0", "can0")

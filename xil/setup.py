@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from controller.build import Build
+from dbc.build import Build
 from dbc.catalogue import Catalogue
 from dbc.vehicle import Vehicle
 from xil.bus import BusChoice

@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from controller.bench.sets import Instance, pack_instance
-from controller.build import Build, find_compiler
 from controller.problem import Array, OcpOptions
 from controller.riccati.build import write_sources
 from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import NlpBuffers
+from dbc.build import Build, find_compiler
 from dbc.errors import SetupFailure
 from dbc.vehicle import ModelParameters
 

@@ -8,7 +8,8 @@ import struct
 from pathlib import Path
 from typing import Any
 
-from controller.build import METADATA_NAME, Build
+from controller.build import METADATA_NAME
+from dbc.build import Build
 
 _LOAD = 1  # PT_LOAD of an ELF program header
 _POINTER_BYTES = ctypes.sizeof(ctypes.c_void_p)

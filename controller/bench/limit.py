@@ -9,10 +9,10 @@ import numpy as np
 
 from controller.bench.measure import Measurement, one_quiet_core, solve
 from controller.bench.sets import pack_instance
-from controller.build import Build
 from controller.problem import OcpOptions
 from controller.riccati.solver import RiccatiBackEnd
 from controller.solver import NlpBuffers, Solver
+from dbc.build import Build
 
 CALLS = 20
 BATCHES = 200

@@ -14,10 +14,10 @@ from controller.bench.library import describe_library, describe_machine
 from controller.bench.limit import limit_of
 from controller.bench.measure import SOFT_SOLVERS, UNIT_SOLVER, Measurement, interleaved
 from controller.bench.sets import Instance
-from controller.build import Build
 from controller.problem import OcpOptions
 from controller.solver import Solver
 from controller.solvers import LIBRARIES, SOLVERS, make_solver
+from dbc.build import Build
 from dbc.errors import UserMistake
 from dbc.vehicle import FOCUS, Vehicle, load_vehicle
 

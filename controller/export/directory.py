@@ -14,7 +14,6 @@ import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from controller.bench.library import describe_library, describe_machine
-from controller.build import Build
 from controller.export.targets import TARGETS, TargetName
 from controller.export.vectors import Vector, record, write_vectors
 from controller.nmpc import DRIVE_MODEL
@@ -22,6 +21,7 @@ from controller.problem import OcpOptions
 from controller.riccati.build import FLAGS, build_riccati, host_flags, write_sources
 from controller.riccati.emit import SIZES_NAME
 from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
+from dbc.build import Build
 from dbc.errors import UserMistake
 from dbc.vehicle import Vehicle, load_vehicle
 

@@ -8,12 +8,13 @@ from typing import Any
 
 from rich.table import Table
 
-from controller.build import METADATA_NAME, Build
+from controller.build import METADATA_NAME
 from controller.export.targets import TARGETS, TargetName, find_toolchain
 from controller.nmpc import DRIVE_MODEL
 from controller.problem import OcpOptions
 from controller.riccati.build import build_riccati
 from controller.solvers import DEFAULT_SOLVER, LIBRARIES
+from dbc.build import Build
 from dbc.vehicle import load_vehicle
 
 CROSS_SOLVER = "riccati"

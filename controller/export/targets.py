@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from controller.build import ZIG, BuildError, Compiler, compiler_at
+from dbc.build import ZIG, BuildError, Compiler, compiler_at
 
 
 class TargetName(StrEnum):
@@ -72,7 +72,7 @@ TARGETS = {
         emulator=("qemu-arm-static", "-cpu", "cortex-a15"),
     ),
 }
-"""Every target but the host, whose compiler and flags `controller.build` and `controller.riccati.build` find out."""
+"""Every target but the host, whose compiler and flags `dbc.build` and `controller.riccati.build` find out."""
 
 
 def find_toolchain(name: TargetName) -> tuple[Compiler, tuple[str, ...]]:

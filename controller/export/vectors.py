@@ -11,12 +11,12 @@ import numpy as np
 from controller.bench.loop import drive
 from controller.bench.scenarios import Case, active_cases, nominal_cases
 from controller.bench.sets import HARD_KINDS, Instance, RecordingSolver, hard
-from controller.build import Build
 from controller.nmpc import Nmpc
 from controller.problem import Array, OcpOptions
 from controller.riccati.solver import RiccatiBackEnd, RiccatiSolver
 from controller.soft import PENALTY_LINEAR, PENALTY_QUADRATIC
 from controller.solver import Effort, NlpBuffers, SqpSolver
+from dbc.build import Build
 from dbc.errors import SetupFailure
 from dbc.vehicle import Vehicle
 

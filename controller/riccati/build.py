@@ -4,8 +4,9 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from controller.build import Build, Compiler, Recipe, build_from
+from controller.build import recipe
 from controller.problem import OcpOptions
+from dbc.build import Build, Compiler, build_from
 from dbc.vehicle import ModelParameters
 
 C_SOURCES = Path(__file__).parent / "c"
@@ -41,7 +42,7 @@ def build_riccati(
     """
     flags = (*FLAGS, *(host_flags() if target_flags is None else target_flags))
     sources = tuple(f"riccati/c/{path.name}" for path in sorted(C_SOURCES.iterdir()))
-    return build_from(Recipe(car, options, (*_KEYED_SOURCES, *sources), flags, write_sources), progress, compiler)
+    return build_from(recipe(car, options, (*_KEYED_SOURCES, *sources), flags, write_sources), progress, compiler)
 
 
 def host_flags(cpuinfo: Path = Path("/proc/cpuinfo")) -> tuple[str, ...]:

@@ -1,13 +1,16 @@
 """The library cache and the compilers. No test here runs a real compiler."""
 
+import importlib.util
 import sys
 from pathlib import Path
 
 import pytest
 
-from controller import build as builder
-from controller.build import BuildError, build, cache_directory, find_compiler
+from controller import build as recipes
+from controller.build import build
 from controller.problem import OcpOptions
+from dbc import build as builder
+from dbc.build import BuildError, cache_directory, find_compiler
 from dbc.errors import SetupFailure
 
 FAKE_COMPILER = """#!{python}
@@ -78,13 +81,13 @@ def test_another_compiler_means_a_new_library(fake, vehicle, tmp_path, monkeypat
 
 def test_changed_sources_mean_a_new_library(fake, vehicle, monkeypatch):
     first = build(vehicle.model, OcpOptions(), print)
-    monkeypatch.setattr(builder, "_KEYED_SOURCES", ("model.py",))
+    monkeypatch.setattr(recipes, "_KEYED_SOURCES", ("model.py",))
     assert build(vehicle.model, OcpOptions(), print).library != first.library
 
 
 def test_every_module_that_the_code_comes_from_is_in_the_key():
-    sources = Path(builder.__file__).parent
-    for keyed in (builder._KEYED_SOURCES, builder._KEYED_SOURCES + builder._QRQP_SOURCES):
+    sources = Path(recipes.__file__).parent
+    for keyed in (recipes._KEYED_SOURCES, recipes._KEYED_SOURCES + recipes._QRQP_SOURCES):
         for name in keyed:
             for line in (sources / name).read_text().splitlines():
                 if line.startswith("from controller.") and name != "build.py":
@@ -112,11 +115,11 @@ def test_losing_the_race_takes_the_winners_library(fake, vehicle, monkeypatch):
     """Another process publishes while this one compiles."""
     publish = builder._publish
 
-    def publish_after_another(work, directory):
+    def publish_after_another(work, directory, name):
         directory.mkdir()
         for file in work.iterdir():
             (directory / file.name).write_bytes(file.read_bytes())
-        publish(work, directory)
+        publish(work, directory, name)
 
     monkeypatch.setattr(builder, "_publish", publish_after_another)
     library = build(vehicle.model, OcpOptions(), print).library
@@ -127,7 +130,8 @@ def test_losing_the_race_takes_the_winners_library(fake, vehicle, monkeypatch):
 def test_no_compiler_is_one_line_that_says_what_to_do(monkeypatch, tmp_path, vehicle):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("CC", raising=False)
-    monkeypatch.setattr(builder.importlib.util, "find_spec", lambda name: None)
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(builder.importlib.util, "find_spec", lambda name: None if name == "ziglang" else find_spec(name))
     with pytest.raises(SetupFailure) as caught:
         build(vehicle.model, OcpOptions(), print)
     assert "no C compiler" in str(caught.value)

@@ -15,7 +15,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from controller.build import BuildError
 from controller.export import library, targets
 from controller.export.directory import ExportError, export
 from controller.export.targets import TARGETS, TargetName, find_toolchain
@@ -25,6 +24,7 @@ from controller.problem import OcpOptions
 from controller.riccati.build import build_riccati
 from controller.riccati.solver import RiccatiSolver
 from controller.solver import Effort
+from dbc.build import BuildError
 from dbc.errors import SetupFailure
 from dbc.vehicle import FOCUS
 

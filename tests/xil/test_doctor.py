@@ -68,7 +68,7 @@ def test_the_compiler_is_the_one_that_builds_take(empty_path):
 
 
 def test_no_compiler(empty_path, monkeypatch):
-    monkeypatch.setattr("controller.build.importlib.util.find_spec", lambda name: None)
+    monkeypatch.setattr("dbc.build.importlib.util.find_spec", lambda name: None)
     check = named("C compiler")
     assert (check.is_ok, check.found) == (False, "none")
     assert check.advice.startswith("no C compiler found: install gcc or clang, or `pip install ziglang`")

@@ -16,10 +16,10 @@ from controller.bench.measure import Measurement, interleaved
 from controller.bench.scenarios import active_cases, nominal_cases
 from controller.bench.sets import Instance
 from controller.bench.table import to_table
-from controller.build import find_compiler
 from controller.problem import OcpOptions
 from controller.solver import Effort, SolveResult, SolveStatus
 from controller.solvers import LIBRARIES
+from dbc.build import find_compiler
 from dbc.errors import UserMistake
 
 SOLVERS = ("casadi-vm", "casadi-c", "riccati")

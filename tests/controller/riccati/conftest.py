@@ -11,13 +11,13 @@ import pytest
 from controller.bench.loop import drive
 from controller.bench.scenarios import nominal_scenarios
 from controller.bench.sets import RecordingSolver
-from controller.build import find_compiler
 from controller.compiled import CompiledBackEnd
 from controller.nmpc import Nmpc
 from controller.problem import OcpOptions
 from controller.riccati.build import SCALAR, build_riccati, write_sources
 from controller.riccati.solver import RiccatiSolver
 from controller.solver import SolveStatus, SqpSolver
+from dbc.build import find_compiler
 
 
 @pytest.fixture(scope="session")

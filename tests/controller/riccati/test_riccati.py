@@ -307,7 +307,7 @@ def test_every_source_is_in_the_key_of_the_cache(vehicle, monkeypatch):
     build_riccati(vehicle.model, OcpOptions(), print)
     build_riccati(vehicle.model, OcpOptions(), print, ("-DLANES=1",))
     assert recipes[0].flags != recipes[1].flags
-    keyed = set(recipes[0].keyed_sources)
+    keyed = set(recipes[0].ingredients["sources"])
     assert {f"riccati/c/{path.name}" for path in C_SOURCES.iterdir()} <= keyed
     package = C_SOURCES.parent.parent
     for name in keyed:
