@@ -1,14 +1,18 @@
-"""The one way onto a CAN bus: python-can behind three calls that never raise on what the bus does.
+"""The one way onto the car's CAN buses: python-can behind three calls that never raise on what a bus does.
 
-A bus is named as python-can names it, `INTERFACE:CHANNEL`: `socketcan:vcan0`, `xilgate:bus0`.
+A bus is named as python-can names it, `INTERFACE:CHANNEL`: `socketcan:vcan0`, `xilgate:robots`. `BusSet` is all that a car has,
+`CanLink` one of them.
 """
 
+import contextlib
 import time
+from collections.abc import Mapping
 from types import TracebackType
-from typing import Self
+from typing import Protocol, Self, runtime_checkable
 
 import can
 
+from dbc.catalogue import NAVIGATION, ROBOTS, Catalogue
 from dbc.errors import SetupFailure
 from dbc.frame import CanFrame
 
@@ -18,6 +22,14 @@ MAX_FRAMES_PER_RECEIVE = 512
 
 class LinkError(SetupFailure):
     """The bus cannot be opened; one line that says why."""
+
+
+@runtime_checkable
+class Disturbable(Protocol):
+    """A bus on which errors can be made, as the emulated one is."""
+
+    def disturb(self, arbitration_id: int | None, count: int) -> None:
+        """Destroy the next transmissions of a message on the wire; None: of any."""
 
 
 class CanLink:
@@ -94,6 +106,21 @@ class CanLink:
             else:
                 self.is_alive = True
 
+    def disturb(self, arbitration_id: int | None, count: int) -> bool:
+        """Destroy the next transmissions of a message on the wire, for a bench; None: of any.
+
+        Returns:
+            Whether the bus does such a thing.
+        """
+        if not isinstance(self._bus, Disturbable):
+            return False
+        try:
+            self._bus.disturb(arbitration_id, count)
+        except (can.CanError, OSError):
+            self.send_errors += 1
+            self.is_alive = False
+        return True
+
     def close(self) -> None:
         """Leave the bus."""
         self._bus.shutdown()
@@ -103,3 +130,94 @@ class CanLink:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+def bus_names(robots: str, navigation: str | None = None) -> dict[str, str]:
+    """Name of the bus of every network; the navigation system is on the robots' bus where it has none of its own."""
+    return {ROBOTS: robots, NAVIGATION: navigation or robots}
+
+
+class BusSet:
+    """The buses of a car as one: each frame travels on the bus of its message, as the catalogue has it.
+
+    A message that arrives on another bus than its own is counted and dropped: what is true of the robots is said on their bus
+    alone. A frame whose identifier the catalogue does not know passes, for whoever judges frames to count; to be sent, it goes
+    out on the robots' bus.
+
+    Args:
+        buses: bus of every network of the catalogue, `INTERFACE:CHANNEL`; networks that name the same one share a link.
+
+    Attributes:
+        misplaced_frames: frames dropped because they came on the wrong bus.
+
+    Raises:
+        LinkError: a bus does not open; the text names its network.
+    """
+
+    def __init__(self, buses: Mapping[str, str], catalogue: Catalogue) -> None:
+        self.misplaced_frames = 0
+        self._links: dict[str, CanLink] = {}
+        with contextlib.ExitStack() as opened:
+            for network, bus_name in buses.items():
+                if bus_name not in self._links:
+                    self._links[bus_name] = opened.enter_context(_open(network, bus_name))
+            self._opened = opened.pop_all()
+        self._by_network = {network: self._links[bus_name] for network, bus_name in buses.items()}
+        self._by_id = {arbitration_id: self._by_network[spec.network] for arbitration_id, spec in catalogue.by_id.items()}
+
+    def receive(self) -> list[CanFrame]:
+        """All frames that have arrived since the last call, bus by bus, oldest first on each."""
+        frames: list[CanFrame] = []
+        for link in self._links.values():
+            arrived = link.receive()
+            own = [frame for frame in arrived if self._by_id.get(frame.arbitration_id, link) is link]
+            self.misplaced_frames += len(arrived) - len(own)
+            frames += own
+        return frames
+
+    def send(self, frames: list[CanFrame]) -> None:
+        """Hand frames to their buses; what one refuses is counted and dropped, because a later frame supersedes it."""
+        robots = self._by_network[ROBOTS]
+        for link in self._links.values():
+            if own := [frame for frame in frames if self._by_id.get(frame.arbitration_id, robots) is link]:
+                link.send(own)
+
+    def disturb(self, arbitration_id: int | None, count: int) -> bool:
+        """Destroy the next transmissions of a message on the wire, for a bench; None: of any, on each bus.
+
+        Returns:
+            Whether the buses do such a thing.
+        """
+        links = list(self._links.values())
+        if arbitration_id is not None:
+            links = [self._by_id.get(arbitration_id, self._by_network[ROBOTS])]
+        were_disturbed = [link.disturb(arbitration_id, count) for link in links]
+        return all(were_disturbed)
+
+    @property
+    def dead(self) -> list[str]:
+        """Networks whose bus refuses to deliver or to accept frames; silence alone is no refusal."""
+        return [network for network, link in self._by_network.items() if not link.is_alive]
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Received frames that nobody is shown, by cause."""
+        causes = {"wrong bus": self.misplaced_frames, "no classical data frame": sum(link.ignored_frames for link in self._links.values())}
+        return {cause: count for cause, count in causes.items() if count}
+
+    def close(self) -> None:
+        """Leave every bus."""
+        self._opened.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+
+def _open(network: str, bus_name: str) -> CanLink:
+    try:
+        return CanLink(bus_name)
+    except LinkError as error:
+        raise LinkError(f"{network}: {error}") from error

@@ -4,26 +4,26 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from dbc.errors import UserMistake
+from dbc.ins import InsParameters
+from dbc.multibody import MultibodyParameters
+from dbc.powertrain import PowertrainParameters
+from dbc.robots import Robots
+from dbc.section import Section
 
 FOCUS = Path(__file__).with_name("focus.toml")
 
 Positive = Annotated[float, Field(gt=0.0)]
 NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class VehicleError(UserMistake):
     """A vehicle file cannot be used; one line per mistake, each with file and key."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
-
-
-class Body(_Section):
+class Body(Section):
     """Outline of the car."""
 
     length_m: Positive
@@ -31,21 +31,21 @@ class Body(_Section):
     front_overhang_m: NotNegative
 
 
-class Steering(_Section):
+class Steering(Section):
     """Steering wheel to road wheel."""
 
     ratio: Positive
     road_wheel_limit_rad: Positive
 
 
-class Pedals(_Section):
+class Pedals(Section):
     """Calibration of the pedals as the gateway believes it."""
 
     full_drive_force_n: Positive
     full_brake_force_n: Positive
 
 
-class ModelParameters(_Section):
+class ModelParameters(Section):
     """Parameters of the controller's bicycle model: M, I_z, L_f, L_r, K_f, K_r, T_max, R, C_r0, C_r2 of the paper, and lags."""
 
     mass_kg: Positive
@@ -62,78 +62,7 @@ class ModelParameters(_Section):
     drive_lag_s: Positive
 
 
-class PlantParameters(_Section):
-    """Parameters of the emulated car."""
-
-    mass_kg: Positive
-    yaw_inertia_kgm2: Positive
-    cog_to_front_m: Positive
-    cog_to_rear_m: Positive
-    cog_height_m: Positive
-    track_front_m: Positive
-    track_rear_m: Positive
-    roll_stiffness_front_share: Share
-    friction: Positive
-    tyre_cornering_stiffness_per_load: Positive
-    tyre_shape_c: Annotated[float, Field(ge=1.0, lt=2.0)]
-    tyre_load_sensitivity: NotNegative
-    tyre_nominal_load_n: Positive
-    front_compliance_radpn: NotNegative
-    relaxation_length_m: Positive
-    full_drive_force_n: Positive
-    drag_torque_force_n: NotNegative
-    full_brake_force_n: Positive
-    brake_front_share: Share
-    drive_lag_s: Positive
-    brake_lag_s: Positive
-    rolling_resistance_coefficient: NotNegative
-    drag_area_m2: NotNegative
-
-
-class SteeringRobot(_Section):
-    """Dynamics of the steering robot, at the steering wheel."""
-
-    bandwidth_hz: Positive
-    damping_ratio: Positive
-    dead_time_s: NotNegative
-    rate_limit_radps: Positive
-    range_rad: Positive
-
-
-class PedalRobot(_Section):
-    """Dynamics of a pedal robot; positions and rates are shares of the learned stroke."""
-
-    bandwidth_hz: Positive
-    damping_ratio: Positive
-    dead_time_s: NotNegative
-    rate_limit_per_s: Positive
-    stroke_m: Positive
-
-
-class Robots(_Section):
-    """The three driving robots."""
-
-    steering: SteeringRobot
-    accelerator: PedalRobot
-    brake: PedalRobot
-
-
-class InsParameters(_Section):
-    """Errors of the navigation system."""
-
-    latency_s: NotNegative
-    position_sigma_m: NotNegative
-    position_correlation_s: Positive
-    position_white_sigma_m: NotNegative
-    velocity_sigma_mps: NotNegative
-    heading_sigma_rad: NotNegative
-    heading_correlation_s: Positive
-    heading_white_sigma_rad: NotNegative
-    yaw_rate_sigma_radps: NotNegative
-    acceleration_sigma_mps2: NotNegative
-
-
-class Vehicle(_Section):
+class Vehicle(Section):
     """One car: what it is, what the controller believes of it, and its instruments."""
 
     name: str
@@ -141,7 +70,8 @@ class Vehicle(_Section):
     steering: Steering
     pedals: Pedals
     model: ModelParameters
-    plant: PlantParameters
+    multibody: MultibodyParameters
+    powertrain: PowertrainParameters
     robots: Robots
     ins: InsParameters
 

@@ -9,7 +9,7 @@ from dbc.frame import CanFrame
 from gateway.limits import Demand, clamp
 from gateway.messages import Mode
 
-NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelVehicle", "MilliTime", "NcomStatus00")
+NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelLevel", "MilliTime", "NcomStatus00")
 ROBOT_MESSAGES = ("RC_SafetyStatus", "SR_Status", "AR_Status", "BR_Status")
 NEEDED_MESSAGES = NAVIGATION_MESSAGES + ROBOT_MESSAGES
 COMMAND_MESSAGES = ("GW_SafetyCommand", "SR_Command", "AR_Command", "BR_Command", "GW_Heartbeat")
@@ -195,7 +195,7 @@ def _decode_yaw_rate(m: Measurement, v: dict[str, float]) -> None:
 
 
 def _decode_acceleration(m: Measurement, v: dict[str, float]) -> None:
-    m.ax_mps2 = v["AccelX"]
+    m.ax_mps2 = v["AccelForward"]
 
 
 def _decode_time(m: Measurement, v: dict[str, float]) -> None:
@@ -219,7 +219,7 @@ _DECODERS = {
     "VelocityLevel": _decode_velocity,
     "VelYawLocal": _decode_yaw,
     "RateVehicle": _decode_yaw_rate,
-    "AccelVehicle": _decode_acceleration,
+    "AccelLevel": _decode_acceleration,
     "MilliTime": _decode_time,
     "SR_Status": _decode_steering,
     "AR_Status": _decode_accelerator,

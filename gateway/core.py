@@ -24,6 +24,8 @@ TICK_NS = 10_000_000
 ENGAGE_GRACE_NS = 200_000_000
 """Time that the robots have to follow into Engaged [ns]."""
 
+_TIME_MESSAGE = "MilliTime"
+"""Tells the time of validity of the navigation data."""
 _EVENT_OF_OPERATION = {
     Operation.ENGAGE: Event.ENGAGE_REQUESTED,
     Operation.DISENGAGE: Event.DISENGAGE_REQUESTED,
@@ -59,7 +61,7 @@ class GatewayCore:
         self._ratio = vehicle.steering.ratio
         self._boot_id = boot_id
         self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps))
-        self._navigation_timeout_ns = catalogue.by_name["MilliTime"].timeout_ns
+        self._navigation_timeout_ns = catalogue.by_name[_TIME_MESSAGE].timeout_ns
         self._heartbeat_ticks = catalogue.by_name["GW_Heartbeat"].cycle_time_ns // TICK_NS
         self._modes = ModeMachine()
         self._safe_stop: SafeStop | None = None
@@ -105,7 +107,7 @@ class GatewayCore:
         self._codec.update(self.measurement, self.supervisor.observe(frames))
         if self.measurement.navigation_time_ms != previous_time_ms:
             # Only a new time of validity makes the state young: a frozen navigation system grows old.
-            self._state_time_ns = frames[-1].t_ns
+            self._state_time_ns = self.supervisor.arrival_ns(_TIME_MESSAGE)
 
     def _situation(self, now_ns: int) -> Situation:
         return Situation(

@@ -1,5 +1,7 @@
 """What the gateway tells telemetry of a step, and how often."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import count
 
 from gateway.core import GatewayCore, StepOutput
@@ -9,6 +11,23 @@ STATE_EVERY_TICKS = 2
 STATUS_EVERY_TICKS = 10
 
 
+@dataclass(frozen=True, slots=True)
+class Process:
+    """What the process around the core knows of itself; in virtual time there is nothing to know.
+
+    Args:
+        ticks_late: periods skipped since its start.
+        step_cpu_ms: CPU time of the step [ms].
+        dead_buses: networks whose bus refuses to deliver or to accept frames.
+        frames_dropped: received frames that the core was not shown, by cause.
+    """
+
+    ticks_late: int = 0
+    step_cpu_ms: float = 0.0
+    dead_buses: Sequence[str] = ()
+    frames_dropped: Mapping[str, int] = field(default_factory=dict)
+
+
 class GatewaySampler:
     """Makes the samples that are due after a step: on their cycle, and at every change of mode."""
 
@@ -16,13 +35,13 @@ class GatewaySampler:
         self._state_seq = count()
         self._status_seq = count()
 
-    def sample(self, core: GatewayCore, output: StepOutput, now_ns: int, ticks_late: int, step_cpu_ms: float) -> list[Sample]:
+    def sample(self, core: GatewayCore, output: StepOutput, now_ns: int, process: Process) -> list[Sample]:
         """Samples of this step, possibly none."""
         samples: list[Sample] = []
         if core.ticks % STATE_EVERY_TICKS == 0 or output.transition is not None:
             samples.append(_state(next(self._state_seq), core, output, now_ns))
         if core.ticks % STATUS_EVERY_TICKS == 0 or output.transition is not None:
-            samples.append(_status(next(self._status_seq), core, now_ns, ticks_late, step_cpu_ms))
+            samples.append(_status(next(self._status_seq), core, now_ns, process))
         return samples
 
 
@@ -49,7 +68,7 @@ def _state(seq: int, core: GatewayCore, output: StepOutput, now_ns: int) -> Stat
     )
 
 
-def _status(seq: int, core: GatewayCore, now_ns: int, ticks_late: int, step_cpu_ms: float) -> StatusSample:
+def _status(seq: int, core: GatewayCore, now_ns: int, process: Process) -> StatusSample:
     return StatusSample(
         t_ns=now_ns,
         seq=seq,
@@ -58,9 +77,10 @@ def _status(seq: int, core: GatewayCore, now_ns: int, ticks_late: int, step_cpu_
         blockers=core.blockers,
         command_age_ms=min(core.commands.age_ns(now_ns) * 1e-6, 1e6),
         frames_received=core.supervisor.received,
-        frames_rejected=dict(core.supervisor.rejected),
+        frames_rejected={**core.supervisor.rejected, **process.frames_dropped},
         commands_rejected=dict(core.commands.rejected),
         ticks=core.ticks,
-        ticks_late=ticks_late,
-        step_cpu_ms=step_cpu_ms,
+        ticks_late=process.ticks_late,
+        step_cpu_ms=process.step_cpu_ms,
+        dead_buses=list(process.dead_buses),
     )

@@ -66,6 +66,14 @@ class Supervisor:
             return status.value
         return None
 
+    def arrival_ns(self, name: str) -> int:
+        """Time at which the newest good frame of a needed message arrived [ns].
+
+        Raises:
+            KeyError: there has been none.
+        """
+        return self._last_good_ns[name]
+
     def missing(self, now_ns: int) -> list[str]:
         """Needed messages without a good frame for longer than their timeout in the DBC."""
         return [

@@ -26,7 +26,7 @@ ALLOWED_IMPORTS = {
 
 # Modules that decide: same input, same output, in virtual time as in real time.
 PURE_MODULES = {
-    "dbc": ("frame", "catalogue", "e2e", "vehicle"),
+    "dbc": ("frame", "catalogue", "packing", "e2e", "vehicle", "section", "multibody"),
     "gateway": (
         *("messages", "codec", "supervision", "commands", "conditions", "modes"),
         *("limits", "actuation", "safe_stop", "core"),
@@ -37,8 +37,16 @@ PURE_MODULES = {
         *("planning/speed", "planning/reference", "planning/reference_sources"),
     ),
     "vehicle_emulator": (
-        *("plant", "actuators", "robots", "ins", "emulator"),
-        *("commands", "robot_system", "supervisor", "bus/core", "bus/wire"),
+        *(f"faults/{name}" for name in ("kinds", "spec", "condition", "schedule", "frames", "effects", "targets", "instance")),
+        *("faults/engine", "faults/operations", "operation", "driver"),
+        *("actuators", "car_bus", "emulator", "lift", "safety_driver"),
+        *(f"robots/{name}" for name in ("faults", "receiver", "states", "supervisor", "robot", "steering", "pedal", "reports", "system")),
+        *(f"plants/multibody/{name}" for name in ("layout", "symbols", "parameters", "chassis", "tyre", "bristle", "brake", "steering")),
+        *(f"plants/multibody/{name}" for name in ("equations", "stability", "plant", "powertrain", "gearbox")),
+        *("road", "plants/interface", "plants/bicycle", "plants/column", "plants/commonroad", "plants/fmu_mapping"),
+        *(f"bus/{name}" for name in ("analysis", "attempt", "bits", "confinement", "core")),
+        *(f"bus/{name}" for name in ("error_frames", "frame", "load", "node", "wire")),
+        *(f"ins/{name}" for name in ("axes", "errors", "instrument", "messages", "motion", "receiver", "schedule", "solution")),
     ),
 }
 IMPURE = {"can", "zenoh", "time", "threading", "os", "logging", "socket", "asyncio"}

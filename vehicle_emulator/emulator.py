@@ -1,165 +1,202 @@
-"""The heart of the emulator: one millisecond of the car, from the gateway's frames to the frames of robots and navigation system."""
+"""The heart of the emulator: one millisecond of the car, from the gateway's frames to the frames of all that answers it."""
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from random import Random
 
 from dbc.catalogue import Catalogue, CatalogueError
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from dbc.vehicle import Vehicle
-from vehicle_emulator import ins, robot_system
+from vehicle_emulator import car_bus, ins
+from vehicle_emulator.car_bus import CarBus
+from vehicle_emulator.faults.condition import Situation
+from vehicle_emulator.faults.effects import Disturbance
+from vehicle_emulator.faults.engine import FaultEngine
+from vehicle_emulator.faults.spec import FaultSpec
 from vehicle_emulator.ins import NavigationSystem
-from vehicle_emulator.plant import AIR_DENSITY_KGPM3, GRAVITY_MPS2, FourWheelPlant, Plant, PlantInputs
-from vehicle_emulator.robot_system import RobotPositions, RobotSystem
+from vehicle_emulator.lift import Car
+from vehicle_emulator.plants import make_plant
+from vehicle_emulator.plants.interface import PlantInputs, PlantState, Progress, Road, RoadPoint, silent
+from vehicle_emulator.road import RoadDescription, make_road
+from vehicle_emulator.robots import system
+from vehicle_emulator.robots.system import RobotSystem
+from vehicle_emulator.safety_driver import SafetyDriver
 
 STEP_NS = 1_000_000
 """Time that one step advances the car [ns]."""
+STEP_S = STEP_NS * 1e-9
+DEFAULT_PLANT = "multibody"
 _GATEWAY = "GW"
-_DRIVER_BRAKE_NORM = 0.3
-"""Brake pedal that holds a standing car on a slope of 30 %."""
-_DRIVER_GAIN_PER_S = 1.0
-"""Acceleration that the safety driver asks for per m/s of speed error."""
 
 
 @dataclass(frozen=True, slots=True)
 class StartPose:
-    """Where the car starts: local frame, x east and y north, yaw counter-clockwise from x, forward speed, and how the road climbs.
-
-    Args:
-        grade: rise over run, in the direction in which the car points.
-    """
+    """Where the car starts: local frame, x east and y north, yaw counter-clockwise from x, and its forward speed."""
 
     x_m: float = 0.0
     y_m: float = 0.0
     yaw_rad: float = 0.0
     speed_mps: float = 0.0
-    grade: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class EmulatorSetup:
+    """What is emulated.
+
+    Args:
+        plant: one of `plants.CHOICES`.
+        is_lifted: whether the car begins on the lift, see `vehicle_emulator.lift`.
+        faults: that are there from the start.
+        seed: of everything that is random.
+    """
+
+    vehicle: Vehicle
+    start: StartPose = field(default_factory=StartPose)
+    road: RoadDescription = field(default_factory=RoadDescription)
+    plant: str = DEFAULT_PLANT
+    is_lifted: bool = False
+    faults: tuple[FaultSpec, ...] = ()
+    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
     """What is really so, at the centre of gravity, ISO 8855 axes; the steering angle is that of the steering wheel."""
 
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    vx_mps: float
-    vy_mps: float
-    yaw_rate_radps: float
-    ax_mps2: float
-    ay_mps2: float
+    state: PlantState
     sr_angle_rad: float
     ar_position_norm: float
     br_position_norm: float
     are_robots_engaged: bool
+    is_lifted: bool = False
 
 
 class Emulator:
-    """The car on its bus: every message of the DBC that the gateway does not send.
+    """The car on its buses: every message of the DBC that the gateway does not send.
 
-    Deterministic: the same seed, start and frames give the same bytes.
-
-    Until the robots are engaged for the first time, a virtual safety driver holds the start speed with the accelerator, or the
-    standing car with the brake, and steers straight ahead; afterwards nobody touches pedals or wheel but the robots. The dead-man
-    switch is always pressed.
+    Deterministic: the same setup and frames give the same bytes. Until the robots are engaged for the first time, a virtual safety
+    driver holds the start speed, or the standing car; afterwards nobody touches pedals or wheel but the robots.
 
     Args:
-        seed: of the noise of the navigation system.
         start_ns: monotonic time of the start [ns]; the first step is due one `STEP_NS` later.
+        progress: told in one line each what takes time.
 
     Raises:
-        CatalogueError: the DBC lacks a message that the emulator needs, or has one that it cannot fill.
+        UserMistake: the DBC lacks a message that the emulator needs, or has one that it cannot fill; the plant or a fault is not known.
+        SetupFailure: the plant cannot be built on this machine.
+
+    Attributes:
+        car: on its road or on the lift.
+        faults: what is injected.
+        inputs: what acts on the car since the last step.
+        disturbances: transmissions that the buses are to destroy, as of the last step.
     """
 
-    def __init__(self, vehicle: Vehicle, catalogue: Catalogue, start: StartPose, seed: int, start_ns: int) -> None:
+    def __init__(self, setup: EmulatorSetup, catalogue: Catalogue, start_ns: int, progress: Progress = silent) -> None:
         _check(catalogue)
-        self._vehicle = vehicle
-        self._catalogue = catalogue
-        self._start = start
-        self._robots = RobotSystem(vehicle, catalogue, STEP_NS * 1e-9)
-        plant = FourWheelPlant(vehicle.plant, (start.x_m, start.y_m, start.yaw_rad), start.speed_mps, start.grade)
-        self._plant: Plant = plant
-        self._state = plant.state
-        self._ins = NavigationSystem(vehicle.ins, catalogue, Random(seed), period_ns=STEP_NS, start_ns=start_ns, state=self._state)
-        self._outputs = sorted((_Output(catalogue, name, start_ns) for name in _OWN_MESSAGES), key=lambda output: output.arbitration_id)
+        vehicle, start = setup.vehicle, setup.start
+        self._road = _SlipperyRoad(make_road(setup.road))
+        pose = (start.x_m, start.y_m, start.yaw_rad)
+        plant = make_plant(setup.plant, vehicle, self._road, pose, speed_mps=start.speed_mps, progress=progress)
+        self.car = Car(plant, is_lifted=setup.is_lifted)
+        self._robots = RobotSystem(vehicle, catalogue, STEP_S, Random(f"{setup.seed} robots"))
+        self._driver = SafetyDriver(start.speed_mps)
+        self._ins = NavigationSystem(
+            vehicle.ins, catalogue, Random(setup.seed), period_ns=STEP_NS, start_ns=start_ns, state=self.car.state
+        )  # fmt: skip
+        self._car_bus = CarBus(catalogue)
+        self._senders = {name: _Sender(catalogue, name) for name in _OWN_MESSAGES if name in catalogue.by_name}
+        self._cycles = [_Cycle(name, catalogue.by_name[name].cycle_time_ns, start_ns) for name in _CYCLIC_MESSAGES]
+        self.faults = FaultEngine(setup.faults, setup.seed, start_ns, catalogue)
+        self.inputs = PlantInputs()
+        self.disturbances: tuple[Disturbance, ...] = ()
 
     def step(self, now_ns: int, frames: Sequence[CanFrame]) -> list[CanFrame]:
         """Advance the car by `STEP_NS` to `now_ns`, with the frames that have arrived; the frames that are due now."""
-        robots = self._robots.step(now_ns, frames, self._state.vx_mps)
-        self._state = self._plant.step(STEP_NS * 1e-9, self._inputs(robots))
-        self._ins.observe(self._state)
-        return [output.frame(now_ns, self._values(output.name, now_ns)) for output in self._outputs if output.is_due(now_ns)]
+        robots, before = self._robots, self.car.state
+        faults = self.faults.update(now_ns, Situation(before, robots.is_engaged))
+        self._road.factor, self._ins.faults, self.disturbances = faults.friction, faults.ins, faults.disturbances
+        robots.faults.update(faults.robots)
+        driver = faults.driven_by(self._driver.step(STEP_S, before, robots.was_engaged))
+        heard = self.faults.incoming(now_ns, list(frames))
+        inputs = robots.step(now_ns, heard, before, driver)
+        self.inputs = inputs if faults.plant == inputs.faults else inputs._replace(faults=faults.plant)
+        self._ins.observe(self.car.step(STEP_S, self.inputs))
+        return self.faults.outgoing(now_ns, [self._senders[name].frame(now_ns, values) for name, values in self._due(now_ns)])
 
     def truth(self) -> GroundTruth:
         """The state reached by the last step."""
-        return GroundTruth(*self._state, *self._robots.positions, are_robots_engaged=self._robots.is_engaged)
+        state = self.car.state
+        engaged, lifted = self._robots.is_engaged, self.car.is_lifted
+        return GroundTruth(state, state.steering_wheel_rad, *self._robots.pedals, are_robots_engaged=engaged, is_lifted=lifted)
 
-    def _inputs(self, robots: RobotPositions) -> PlantInputs:
-        limit_rad = self._vehicle.steering.road_wheel_limit_rad
-        road_wheel_rad = min(max(robots.steering_wheel_rad / self._vehicle.steering.ratio, -limit_rad), limit_rad)
-        if self._robots.was_engaged:
-            return PlantInputs(road_wheel_rad, robots.accelerator_norm, robots.brake_norm)
-        if self._start.speed_mps > 0.0:
-            return PlantInputs(road_wheel_rad, self._driver_norm(), robots.brake_norm)
-        return PlantInputs(road_wheel_rad, robots.accelerator_norm, max(robots.brake_norm, _DRIVER_BRAKE_NORM))
-
-    def _driver_norm(self) -> float:
-        """Accelerator of the safety driver: what the resistances need, and a correction of the speed."""
-        p, vx_mps = self._vehicle.plant, self._state.vx_mps
-        rolling_n = p.rolling_resistance_coefficient * p.mass_kg * GRAVITY_MPS2
-        air_n = 0.5 * AIR_DENSITY_KGPM3 * p.drag_area_m2 * vx_mps * vx_mps
-        correction_n = p.mass_kg * _DRIVER_GAIN_PER_S * (self._start.speed_mps - vx_mps)
-        climb_n = p.mass_kg * GRAVITY_MPS2 * math.sin(math.atan(self._start.grade))
-        wanted_n = rolling_n + air_n + climb_n + p.drag_torque_force_n + correction_n
-        return min(max(wanted_n / (p.full_drive_force_n + p.drag_torque_force_n), 0.0), 1.0)
-
-    def _values(self, name: str, now_ns: int) -> dict[str, float]:
-        return self._robots.status(name) if name in robot_system.STATUS_MESSAGES else self._ins.message(name, now_ns)
+    def _due(self, now_ns: int) -> list[tuple[str, Mapping[str, float]]]:
+        """Messages to send now, with their signals in the units of the DBC."""
+        cyclic = [cycle.name for cycle in self._cycles if cycle.is_due(now_ns)]
+        messages: list[tuple[str, Mapping[str, float]]] = [
+            (name, self._robots.status(name)) for name in cyclic if name in system.STATUS_MESSAGES and not self._robots.is_silent(name)
+        ]
+        messages += [(name, self._car_bus.message(name, self.car.state, self.inputs)) for name in cyclic if name in car_bus.MESSAGES]
+        messages += [(name, self._ins.message(name, now_ns)) for name in self._ins.due(now_ns)]
+        return messages
 
 
-class _Output:
-    """One cyclic message: when it is due and how its frame is made."""
+class _SlipperyRoad:
+    """A road whose grip a fault may take."""
 
-    def __init__(self, catalogue: Catalogue, name: str, start_ns: int) -> None:
-        spec = catalogue.by_name[name]
+    def __init__(self, road: Road) -> None:
+        self._road = road
+        self.factor = 1.0
+
+    def at(self, x_m: float, y_m: float) -> RoadPoint:
+        """See `Road`."""
+        point = self._road.at(x_m, y_m)
+        return point if self.factor == 1.0 else point._replace(friction=self.factor * point.friction)
+
+
+class _Cycle:
+    """When a cyclic message is due: first one cycle after the start; what a stall has made late is skipped, not sent in a burst."""
+
+    def __init__(self, name: str, cycle_ns: int, start_ns: int) -> None:
         self.name = name
-        self.arbitration_id = spec.arbitration_id
-        self._catalogue = catalogue
-        self._cycle_ns = spec.cycle_time_ns
-        self._due_ns = start_ns + _first_ns(name, spec.cycle_time_ns)
-        self._bounds = {signal: catalogue.bounds(name, signal) for signal in catalogue.signals(name)}
-        self._protector = None if spec.e2e_data_id is None else E2EProtector(spec.e2e_data_id)
+        self._cycle_ns = cycle_ns
+        self._due_ns = start_ns + cycle_ns
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether the message is to be sent; what a stall has made late is skipped, not sent in a burst."""
+        """Whether the message is to be sent."""
         if now_ns < self._due_ns:
             return False
         self._due_ns += self._cycle_ns * (1 + (now_ns - self._due_ns) // self._cycle_ns)
         return True
 
-    def frame(self, now_ns: int, values: dict[str, float]) -> CanFrame:
+
+class _Sender:
+    """Makes the frames of one message."""
+
+    def __init__(self, catalogue: Catalogue, name: str) -> None:
+        spec = catalogue.by_name[name]
+        self._name = name
+        self._arbitration_id = spec.arbitration_id
+        self._catalogue = catalogue
+        self._protector = None if spec.e2e_data_id is None else E2EProtector(spec.e2e_data_id)
+
+    def frame(self, now_ns: int, values: Mapping[str, float]) -> CanFrame:
         """The frame with these values, moved into the range of the DBC where an instrument would saturate."""
-        bounds = self._bounds
-        payload = self._catalogue.encode(self.name, {s: min(max(v, bounds[s][0]), bounds[s][1]) for s, v in values.items()})
-        return CanFrame(self.arbitration_id, self._protector.protect(payload) if self._protector else payload, now_ns)
+        payload = self._catalogue.encode(self._name, values, saturates=True)
+        return CanFrame(self._arbitration_id, self._protector.protect(payload) if self._protector else payload, now_ns)
 
 
-_OWN_MESSAGES = robot_system.STATUS_MESSAGES + ins.MESSAGES
-
-
-def _first_ns(name: str, cycle_ns: int) -> int:
-    """Time from the start to the first frame: one cycle, but the status channels of the navigation system take turns."""
-    turns = ins.STATUS_MESSAGES
-    return (turns.index(name) + 1) * cycle_ns // len(turns) if name in turns else cycle_ns
+_CYCLIC_MESSAGES = (*system.STATUS_MESSAGES, *car_bus.MESSAGES)
+_NEEDED_MESSAGES = (*_CYCLIC_MESSAGES, *ins.CORE_MESSAGES)
+_OWN_MESSAGES = (*_CYCLIC_MESSAGES, *ins.MESSAGES)
 
 
 def _check(catalogue: Catalogue) -> None:
-    catalogue.require(_OWN_MESSAGES + robot_system.COMMAND_MESSAGES, "emulator")
+    catalogue.require((*_NEEDED_MESSAGES, *system.COMMAND_MESSAGES), "emulator")
     files = ", ".join(catalogue.sha256)
     others = {name for name, spec in catalogue.by_name.items() if spec.sender != _GATEWAY}
     if unknown := sorted(others - set(_OWN_MESSAGES)):
         raise CatalogueError(f"{files}: message {', '.join(unknown)}, which the emulator cannot fill")
-    if silent := sorted(name for name in _OWN_MESSAGES if catalogue.by_name[name].cycle_time_ns <= 0):
+    if silent := sorted(name for name in _NEEDED_MESSAGES if catalogue.by_name[name].cycle_time_ns <= 0):
         raise CatalogueError(f"{files}: message {', '.join(silent)}: no GenMsgCycleTime")

@@ -8,7 +8,7 @@ LOST_AFTER_MS = 500.0
 """Age from which a topic counts as lost [ms]; `page/link.js` says the same."""
 SCENE_LOST_AFTER_MS = 2500.0
 """The scene comes once per second only."""
-EVENT_TOPICS = ("parameters",)
+EVENT_TOPICS = ("parameters", "faults")
 """These come when something happens, not regularly."""
 
 _LOCKSTEP_STAGES = ("mil", "sil")

@@ -14,7 +14,7 @@ from dbc.frame import CanFrame
 from dbc.vehicle import Vehicle, load_vehicle
 from gateway.core import TICK_NS, GatewayCore
 from gateway.messages import HORIZON_STEPS, PLAN_PERIOD_NS, CommandStatus, ControlCommand, Mode, Operation, OperatorRequest
-from vehicle_emulator.emulator import STEP_NS, Emulator, StartPose
+from vehicle_emulator.emulator import STEP_NS, Emulator, EmulatorSetup, StartPose
 from xil.summary import machine
 
 START_NS = 1_000_000_000
@@ -78,7 +78,7 @@ def to_table(result: dict[str, Any]) -> Table:
 
 def _record(catalogue: Catalogue, vehicle: Vehicle, seconds: float) -> list[Tick]:
     """Drive until the gateway has been engaged for `seconds`, and keep all that it was given."""
-    emulator = Emulator(vehicle, catalogue, StartPose(speed_mps=START_SPEED_MPS), 1, START_NS)
+    emulator = Emulator(EmulatorSetup(vehicle, StartPose(speed_mps=START_SPEED_MPS), seed=1), catalogue, START_NS)
     gateway = GatewayCore(catalogue, vehicle, boot_id=1)
     ticks: list[Tick] = []
     to_car: list[CanFrame] = []

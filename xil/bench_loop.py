@@ -309,7 +309,10 @@ def with_dead_time(vehicle: Vehicle, dead_time_s: float) -> Vehicle:
 
 def with_mass(vehicle: Vehicle, factor: float) -> Vehicle:
     """The emulated car with a mass that its controller does not know of."""
-    return vehicle.model_copy(update={"plant": vehicle.plant.model_copy(update={"mass_kg": factor * vehicle.plant.mass_kg})})
+    masses = vehicle.multibody.masses
+    names = ("mass_kg", "sprung_roll_inertia_kgm2", "sprung_pitch_inertia_kgm2", "sprung_yaw_inertia_kgm2")
+    heavier = masses.model_copy(update={name: factor * getattr(masses, name) for name in names})
+    return vehicle.model_copy(update={"multibody": vehicle.multibody.model_copy(update={"masses": heavier})})
 
 
 def on_grade(scenario: Scenario, grade_percent: float) -> Scenario:

@@ -1,17 +1,19 @@
-"""Which CAN bus a run uses: the user's `--bus`, checked against what this machine has."""
+"""Which CAN buses a run uses: the user's `--bus` and `--navigation-bus`, checked against what this machine has."""
 
 import os
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from dbc.catalogue import NAVIGATION, ROBOTS
 from dbc.errors import UserMistake
-from vehicle_emulator.bus.channel import BusError, is_served, socket_path
+from dbc.link import bus_names
+from vehicle_emulator.bus.channel import BusError, address_of, is_served
 
 CHOICES = "auto, emulated, socketcan:INTERFACE (for example socketcan:vcan0) or xilgate:CHANNEL"
 
-DEFAULT_CHANNEL = "bus0"
-_DEFAULT_INTERFACE = "vcan0"
+_AUTO_INTERFACES = {ROBOTS: "vcan0", NAVIGATION: "vcan1"}
 _SYS_NET = Path("/sys/class/net")
 # From Linux's if_arp.h and if.h.
 _ARPHRD_CAN = 280
@@ -26,40 +28,69 @@ class BusChoiceError(UserMistake):
 
 @dataclass(frozen=True, slots=True)
 class BusChoice:
-    """The bus of one run.
+    """The buses of one run.
 
     Args:
-        name: bus for `dbc.link.CanLink`, as python-can names it.
-        hub_channel: channel whose hub the runner has to start first; None where the bus is there already.
+        names: bus of every network for `dbc.link.BusSet`, as python-can names it.
+        hub_channels: of the networks whose hub the runner has to start first; the other buses are there already.
     """
 
+    names: Mapping[str, str]
+    hub_channels: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class _Bus:
+    """One bus, and the channel whose hub has to be started for it, if any."""
+
     name: str
-    hub_channel: str | None
+    hub_channel: str | None = None
 
 
-def choose(bus: str) -> BusChoice:
+def choose(bus: str, navigation_bus: str | None = None) -> BusChoice:
     """Resolve the user's choice.
 
     Args:
-        bus: one of `CHOICES`; `auto` is vcan0 where it is up, else the emulated bus.
+        bus: one of `CHOICES`; `auto` is vcan0 where it is up, else an emulated bus.
+        navigation_bus: the same for the navigation system, with vcan1 for `auto`. None goes with `bus`: a second emulated bus beside
+            an emulated one, vcan1 where `auto` found both, else `bus` itself.
 
     Raises:
-        BusChoiceError: unknown choice, or a bus that is not there or not up.
+        BusChoiceError: unknown choice, or a bus that is not there or not up; the text names the option.
     """
+    robots = _resolve("--bus", bus, ROBOTS)
+    if navigation_bus is not None:
+        navigation = _resolve("--navigation-bus", navigation_bus, NAVIGATION)
+    else:
+        navigation = _beside(robots, is_auto=bus == "auto")
+    channels = {ROBOTS: robots.hub_channel, NAVIGATION: navigation.hub_channel}
+    return BusChoice(
+        bus_names(robots.name, navigation.name), {network: channel for network, channel in channels.items() if channel is not None}
+    )
+
+
+def _beside(robots: _Bus, is_auto: bool) -> _Bus:
+    """The bus of the navigation system, where only that of the robots was asked for."""
+    if robots.hub_channel is not None:
+        return _emulated(NAVIGATION)
+    return (_auto(NAVIGATION) if is_auto else None) or robots
+
+
+def _resolve(option: str, bus: str, network: str) -> _Bus:
     interface, separator, channel = bus.partition(":")
     match interface, separator, channel:
         case "auto", "", "":
-            return _emulated() if socketcan_problem(_DEFAULT_INTERFACE) else BusChoice(f"socketcan:{_DEFAULT_INTERFACE}", None)
+            return _auto(network) or _emulated(network)
         case "emulated", "", "":
-            return _emulated()
+            return _emulated(network)
         case "socketcan", ":", name if _INTERFACE_NAME.fullmatch(name):
             if problem := socketcan_problem(name):
-                raise BusChoiceError(f"bus {bus!r}: {'; '.join(problem)}")
-            return BusChoice(bus, None)
+                raise BusChoiceError(f"{option} {bus!r}: {'; '.join(problem)}")
+            return _Bus(bus)
         case "xilgate", ":", name if name:
-            return _running_hub(bus, name)
+            return _running_hub(option, bus, name)
         case _:
-            raise BusChoiceError(f"bus {bus!r}: expected {CHOICES}")
+            raise BusChoiceError(f"{option} {bus!r}: expected {CHOICES}")
 
 
 def socketcan_problem(interface: str) -> tuple[str, str] | None:
@@ -81,17 +112,23 @@ def socketcan_problem(interface: str) -> tuple[str, str] | None:
     return None
 
 
-def _emulated() -> BusChoice:
+def _auto(network: str) -> _Bus | None:
+    interface = _AUTO_INTERFACES[network]
+    return None if socketcan_problem(interface) else _Bus(f"socketcan:{interface}")
+
+
+def _emulated(network: str) -> _Bus:
     # The name that people try first; but runs side by side must not share a bus.
-    channel = f"run-{os.getpid()}" if is_served(DEFAULT_CHANNEL) else DEFAULT_CHANNEL
-    return BusChoice(f"xilgate:{channel}", channel)
+    channel = f"run-{os.getpid()}-{network}" if is_served(network) else network
+    return _Bus(f"xilgate:{channel}", channel)
 
 
-def _running_hub(bus: str, channel: str) -> BusChoice:
+def _running_hub(option: str, bus: str, channel: str) -> _Bus:
     try:
-        path = socket_path(channel)
+        address = address_of(channel)
         if not is_served(channel):
-            raise BusChoiceError(f"bus {bus!r}: no hub serves this channel ({path}); `xilgate bus` starts one")
+            what, start = (f"this channel ({address})", channel) if isinstance(address, Path) else ("this port", f"--tcp {address[1]}")
+            raise BusChoiceError(f"{option} {bus!r}: no hub serves {what}; `xilgate bus {start}` starts one")
     except BusError as error:
-        raise BusChoiceError(f"bus {bus!r}: {error}") from error
-    return BusChoice(bus, None)
+        raise BusChoiceError(f"{option} {bus!r}: {error}") from error
+    return _Bus(bus)

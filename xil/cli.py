@@ -18,7 +18,7 @@ from typing import Annotated, Any
 import typer
 
 from controller.export.targets import TargetName
-from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
+from dbc.catalogue import GNSS_IMU_DBC, NAVIGATION, NETWORKS, ROBOTS, ROBOTS_DBC
 from dbc.errors import SetupFailure, UserMistake
 from dbc.realtime import BUS_PRIORITY, become_realtime
 from dbc.vehicle import FOCUS
@@ -37,6 +37,8 @@ bench = typer.Typer(help="Measure: every command prints a table, or with --json 
 app.add_typer(bench, name="bench")
 params = typer.Typer(help="Look at and change the parameters of a running controller.", no_args_is_help=True)
 app.add_typer(params, name="params")
+fault = typer.Typer(help="Inject faults into a running emulator, look at them and take them back.", no_args_is_help=True)
+app.add_typer(fault, name="fault")
 
 class OperationName(StrEnum):
     """What an operator can ask for."""
@@ -47,15 +49,22 @@ class OperationName(StrEnum):
 
 
 BusOption = Annotated[str, typer.Option("--bus", help="auto, emulated, socketcan:INTERFACE or xilgate:CHANNEL")]
+NavigationBusOption = Annotated[
+    str | None, typer.Option("--navigation-bus", help="the same for the navigation system; default: as --bus, or a second emulated bus")
+]
 DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
+PlantOption = Annotated[str, typer.Option("--plant", help="emulated car: multibody, bicycle, commonroad or fmu:FILE")]
+LiftedOption = Annotated[bool, typer.Option("--lifted/--on-the-road", help="begin with the car on the lift, wheels in the air")]
 PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
 SolverOption = Annotated[
     str | None,
     typer.Option("--solver", help="riccati (soft bounds), casadi-c or qrqp (hard ones), casadi-vm (uncompiled); default: by the stage"),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object instead of a table")]
+DEFAULT_PLANT = "multibody"
 DBC_FILES = [ROBOTS_DBC, GNSS_IMU_DBC]
+CHANNELS = list(NETWORKS)
 
 
 def main() -> None:
@@ -95,7 +104,10 @@ def drive(
         Stage, typer.Option(help="mil, sil: virtual time; hil: processes in real time; vehil: a car on the bus")
     ] = Stage.HIL,
     bus: BusOption = "auto",
+    navigation_bus: NavigationBusOption = None,
     solver: SolverOption = None,
+    plant: PlantOption = DEFAULT_PLANT,
+    is_lifted: LiftedOption = False,
     seed: Annotated[int, typer.Option(min=0, help="of all noise")] = 1,
     out: Annotated[Path | None, typer.Option(help="run directory; default: runs/SCENARIO-STAGE")] = None,
     view: Annotated[bool, typer.Option("--view", help="serve the virtual world while driving")] = False,
@@ -111,7 +123,10 @@ def drive(
         scenario=scenario,
         stage=stage,
         bus=bus,
+        navigation_bus=navigation_bus,
         solver=solver,
+        plant=plant,
+        is_lifted=is_lifted,
         seed=seed,
         out=out or Path("runs") / f"{Path(scenario).stem}-{stage.value}",
         view_port=view_port if view else None,
@@ -131,17 +146,21 @@ def drive(
 
 @app.command()
 def gateway(
-    bus: Annotated[str, typer.Option("--bus", help="python-can name of the bus, for example socketcan:can0")] = "socketcan:can0",
+    bus: Annotated[str, typer.Option("--bus", help="python-can name of the robots' bus, for example socketcan:can0")] = "socketcan:can0",
+    navigation_bus: Annotated[str | None, typer.Option("--navigation-bus", help="that of the navigation system; default: the same")] = None,
     dbc: DbcOption = DBC_FILES,
     vehicle: VehicleOption = FOCUS,
     gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
     controller_socket: Annotated[str, typer.Option(help="control socket of the controller")] = "/tmp/xilgate-controller.sock",
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
 ) -> None:
-    """The gateway process: the only one that writes to the car's bus."""
+    """The gateway process: the only one that writes to the car's buses."""
+    from dbc.link import bus_names  # noqa: PLC0415
+
+    buses = bus_names(bus, navigation_bus)
     _run_daemon(
         "gateway.app",
-        lambda m: m.GatewayOptions(bus, tuple(dbc), vehicle, gateway_socket, controller_socket, telemetry_port),
+        lambda m: m.GatewayOptions(buses, tuple(dbc), vehicle, gateway_socket, controller_socket, telemetry_port),
     )
 
 
@@ -170,28 +189,37 @@ def controller(
 
 @app.command()
 def emulator(
-    bus: Annotated[str, typer.Option("--bus", help="python-can name of the bus")] = "xilgate:bus0",
+    bus: Annotated[str | None, typer.Option("--bus", help="python-can name of the bus; default: the two that `xilgate bus` serves")] = None,
+    navigation_bus: Annotated[str | None, typer.Option("--navigation-bus", help="that of the navigation system; default: as --bus")] = None,
     x_m: Annotated[float, typer.Option("--x-m", help="start position")] = 0.0,
     y_m: Annotated[float, typer.Option("--y-m", help="start position")] = 0.0,
     yaw_rad: Annotated[float, typer.Option("--yaw-rad", help="start heading")] = 0.0,
     speed_mps: Annotated[float, typer.Option("--speed-mps", min=0.0, help="start speed")] = 0.0,
-    grade_percent: Annotated[float, typer.Option("--grade-percent", help="how the road climbs where the car points")] = 0.0,
+    road: Annotated[Path | None, typer.Option("--road", help="TOML file of the road; default: a level one")] = None,
+    plant: PlantOption = DEFAULT_PLANT,
+    is_lifted: LiftedOption = False,
     seed: Annotated[int, typer.Option(min=0)] = 1,
+    faults: Annotated[Path | None, typer.Option("--faults", help="TOML file with [[faults]] to inject; a scenario is one")] = None,
     dbc: DbcOption = DBC_FILES,
     vehicle: VehicleOption = FOCUS,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
 ) -> None:
     """The emulated car with its robots and navigation system."""
+    from dbc.link import bus_names  # noqa: PLC0415
     from vehicle_emulator.emulator import StartPose  # noqa: PLC0415
 
     _run_daemon(
         "vehicle_emulator.app",
         lambda m: m.EmulatorOptions(
-            bus_name=bus,
+            buses=bus_names(bus, navigation_bus) if bus else bus_names(f"xilgate:{ROBOTS}", navigation_bus or f"xilgate:{NAVIGATION}"),
             dbc=tuple(dbc),
             vehicle=vehicle,
-            start=StartPose(x_m, y_m, yaw_rad, speed_mps, 0.01 * grade_percent),
+            start=StartPose(x_m, y_m, yaw_rad, speed_mps),
+            road=road,
+            plant=plant,
+            is_lifted=is_lifted,
             seed=seed,
+            faults=faults,
             telemetry_base_port=telemetry_port,
         ),
     )
@@ -214,13 +242,26 @@ def operate(
 
 
 @app.command("bus")
-def bus_hub(channel: Annotated[str, typer.Argument(help="name of the channel")] = "bus0") -> None:
-    """The emulated CAN bus; any python-can tool joins it with `-i xilgate -c CHANNEL`."""
+def bus_hub(
+    channels: Annotated[list[str], typer.Argument(metavar="CHANNEL...", help="names of the buses")] = CHANNELS,
+    bitrate: Annotated[list[int], typer.Option(min=10_000, max=1_000_000, help="bit/s; once, or once for every channel")] = [500_000],  # noqa: B006
+    data_bitrate: Annotated[int, typer.Option(min=10_000, max=8_000_000, help="bit/s in the data phase of CAN FD")] = 2_000_000,
+    tcp: Annotated[int | None, typer.Option(min=1, max=65_000, help="port on 127.0.0.1 as well; the next channel has the next one")] = None,
+    restart_ms: Annotated[int, typer.Option(min=0, help="time after which a node leaves bus-off by itself; 0: never")] = 100,
+) -> None:
+    """Emulated CAN buses; any python-can tool joins one with `-i xilgate -c CHANNEL`, or `-c tcp://127.0.0.1:PORT`."""
     from vehicle_emulator.bus import hub  # noqa: PLC0415
 
+    if len(bitrate) not in (1, len(channels)):
+        raise UserMistake(f"--bitrate: {len(bitrate)} values for {len(channels)} channels, expected 1 or {len(channels)}")
+    bitrates = bitrate * len(channels) if len(bitrate) == 1 else bitrate
+    options = {
+        channel: hub.HubOptions(bitrate_bps, data_bitrate, None if tcp is None else tcp + index, restart_ms)
+        for index, (channel, bitrate_bps) in enumerate(zip(channels, bitrates, strict=True))
+    }
     become_realtime(BUS_PRIORITY)
     with _stop_on_signal() as stop:
-        hub.run(channel, stop)
+        hub.run(options, stop)
 
 
 @app.command()
@@ -236,6 +277,27 @@ def view(
 def watch(telemetry_port: PortOption = DEFAULT_BASE_PORT) -> None:
     """A live table of what runs."""
     _run_daemon("visualiser.watch", lambda m: m.WatchOptions(telemetry_base_port=telemetry_port))
+
+
+@app.command("object")
+def object_from_outside(
+    name: Annotated[str, typer.Argument(help="by which the object is known again")],
+    x_m: Annotated[float, typer.Option("--x-m", help="centre, in the local frame")],
+    y_m: Annotated[float, typer.Option("--y-m", help="centre, in the local frame")],
+    heading_deg: Annotated[float, typer.Option("--heading-deg", help="counter-clockwise from x")] = 0.0,
+    speed_kmh: Annotated[float, typer.Option("--speed-kmh", help="along its heading")] = 0.0,
+    kind: Annotated[str, typer.Option("--kind", help="car, adult, child or cyclist: gives the size")] = "car",
+    length_m: Annotated[float | None, typer.Option("--length-m", help="default: by the kind")] = None,
+    width_m: Annotated[float | None, typer.Option("--width-m", help="default: by the kind")] = None,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="time after which it goes; an interrupt ends it too")] = 600.0,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+) -> None:
+    """Put an object in the car's way while a run goes on whose scenario has none."""
+    from xil.objects import OutsideObject, publish  # noqa: PLC0415
+
+    thing = OutsideObject(name, x_m, y_m, heading_deg, speed_kmh, kind, length_m, width_m)
+    with _stop_on_signal() as stop:
+        publish(thing, telemetry_port, seconds, stop)
 
 
 @app.command()
@@ -310,6 +372,50 @@ def params_watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOp
         tuner.follow(telemetry_port, stop, lambda sample: print(_json(sample) if as_json else tuner.line(sample), flush=True))
 
 
+@fault.command("add")
+def fault_add(
+    kind: Annotated[str, typer.Argument(help="kind of fault; `fault kinds` has them all")],
+    assignments: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="as in messages=SR_Status duration_s=2")] = None,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Inject a fault; its times count from now."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    answer = injector.add(kind, assignments or [], telemetry_port)
+    _print(answer if as_json else injector.table(answer, "added"), as_json)
+
+
+@fault.command("list")
+def fault_list(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """All faults of the emulator: waiting, active and over."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    answer = injector.listing(telemetry_port)
+    _print(answer if as_json else injector.table(answer, "faults"), as_json)
+
+
+@fault.command("clear")
+def fault_clear(
+    name: Annotated[str | None, typer.Argument(help="name of a fault; default: all")] = None,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a fault back, or all."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    answer = injector.clear(name, telemetry_port)
+    _print(answer if as_json else injector.table(answer, "cleared"), as_json)
+
+
+@fault.command("kinds")
+def fault_kinds(as_json: JsonOption = False) -> None:
+    """What can go wrong, and the keys of each kind."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    _print(injector.kinds_data() if as_json else injector.kinds_table(), as_json)
+
+
 @app.command()
 def build(
     target: Annotated[TargetName, typer.Option(help="processor that the library is for")] = TargetName.HOST,
@@ -365,6 +471,17 @@ def bench_loop(
     _print(result if as_json else loop_bench.to_table(result), as_json)
 
 
+@bench.command("bus")
+def bench_bus(
+    seconds: Annotated[float, typer.Option(min=0.5, help="of each of the two measurements on the hub")] = 5.0, as_json: JsonOption = False
+) -> None:
+    """Throughput and latency of the emulated bus with three nodes, through its real hub, beside the targets."""
+    from xil import bench_bus as bus_bench  # noqa: PLC0415
+
+    result = bus_bench.bench_bus(seconds, _progress)
+    _print(result if as_json else bus_bench.to_table(result), as_json)
+
+
 @bench.command("gateway")
 def bench_gateway(
     seconds: Annotated[float, typer.Option(min=1.0, help="recorded driving")] = 10.0,
@@ -376,6 +493,19 @@ def bench_gateway(
 
     result = gateway_bench.bench_gateway(seconds=seconds, rounds=rounds)
     _print(result if as_json else gateway_bench.to_table(result), as_json)
+
+
+@bench.command("plant")
+def bench_plant(
+    vehicle: VehicleOption = FOCUS,
+    seconds: Annotated[float, typer.Option(min=1.0, help="simulated driving of each measurement")] = 10.0,
+    as_json: JsonOption = False,
+) -> None:
+    """Time of one step of the emulated car, and how far its integrator is from its limit, beside their targets."""
+    from xil import bench_plant as plant_bench  # noqa: PLC0415
+
+    result = plant_bench.bench_plant(vehicle, seconds, _progress)
+    _print(result if as_json else plant_bench.to_table(result), as_json)
 
 
 def _progress(text: str) -> None:

@@ -45,7 +45,7 @@ class Outline:
     @classmethod
     def of(cls, vehicle: Vehicle) -> "Outline":
         """The outline of the real or emulated car."""
-        front_m = vehicle.plant.cog_to_front_m + vehicle.body.front_overhang_m
+        front_m = vehicle.multibody.masses.cog_to_front_m + vehicle.body.front_overhang_m
         return cls(front_m, vehicle.body.length_m - front_m, vehicle.body.width_m / 2.0)
 
     def corners_m(self, x_m: Array, y_m: Array, yaw_rad: Array) -> Array:
@@ -113,12 +113,13 @@ class Course:
     """What a scenario asks of one car.
 
     Args:
-        station_m: stations of the reference's samples, shape (n,).
+        line: the base line; the reference has a sample for each of its own.
         left_edge_m, right_edge_m: the edges of the road, shape (n, 2).
         from_m, to_m: stations between which the drive is judged.
+        ends_short: whether the car is to stand for good before it gets to `to_m`.
     """
 
-    station_m: Array
+    line: Line
     reference: ReferencePath
     left_edge_m: Array
     right_edge_m: Array
@@ -126,6 +127,22 @@ class Course:
     outline: Outline
     from_m: float
     to_m: float
+    ends_short: bool
+
+    @property
+    def station_m(self) -> Array:
+        """Stations of the reference's samples, shape (n,)."""
+        return self.line.station_m
+
+    def is_at_end(self, x_m: float, y_m: float) -> bool:
+        """Whether the car at a place is past the judged part."""
+        return bool(self.project(np.array([x_m]), np.array([y_m])).station_m[0] >= self.to_m)
+
+    def reference_offset_m(self, station_m: float) -> float:
+        """How far to the left of the base line the reference is at a station."""
+        line, path = self.line, self.reference
+        offset_m = (path.y_m - line.y_m) * np.cos(line.yaw_rad) - (path.x_m - line.x_m) * np.sin(line.yaw_rad)
+        return float(np.interp(station_m, line.station_m, offset_m))
 
     def project(self, x_m: Array, y_m: Array) -> Projection:
         """Closest points of the reference, exact between its samples."""

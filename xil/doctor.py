@@ -13,7 +13,7 @@ from rich.table import Table
 from dbc.build import BuildError, find_compiler
 from xil.bus import socketcan_problem
 
-_CAN_INTERFACES = ("vcan0", "can0")
+_CAN_INTERFACES = ("vcan0", "vcan1", "can0", "can1")
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 _PROC_STATUS = Path("/proc/self/status")
 _SYS_REALTIME = Path("/sys/kernel/realtime")

@@ -7,9 +7,9 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -25,7 +25,11 @@ from dbc.vehicle import load_vehicle
 from gateway.core import GatewayCore
 from gateway.limits import PROVING_GROUND
 from gateway.telemetry import StateSample
+from vehicle_emulator.emulator import Emulator
+from vehicle_emulator.faults.targets import check
 from xil.bus import choose
+from xil.buslog import recorded_load
+from xil.injected import injected_faults
 from xil.lockstep import START_NS, LockstepRun
 from xil.metrics import Verdict, evaluate
 from xil.realtime import RealtimeRun
@@ -46,6 +50,7 @@ class DriveOptions:
     """What the user asked for.
 
     Args:
+        navigation_bus: None for what goes with `bus`.
         solver: name, or None for what the stage stands for.
         view_port: port of the virtual world's page, or None for no page.
     """
@@ -53,7 +58,10 @@ class DriveOptions:
     scenario: str
     stage: Stage
     bus: str
+    navigation_bus: str | None
     solver: str | None
+    plant: str
+    is_lifted: bool
     seed: int
     out: Path
     view_port: int | None
@@ -109,24 +117,54 @@ def run_drive(options: DriveOptions) -> Verdict:
         raise SetupFailure(f"{error.filename}: {error.strerror}") from error
 
 
+@dataclass(frozen=True)
+class _Driven:
+    """What came out of a drive; the rest as in `RunFacts`.
+
+    Args:
+        interruption: why it was cut short; empty when it was not.
+    """
+
+    recording: Recording
+    interruption: str
+    realtime_factor: float | None = None
+    bus_load: Mapping[str, float] = field(default_factory=dict)
+
+
 def _run(setup: RunSetup, options: DriveOptions, display: Display) -> Verdict:
     started, start_s = datetime.now(UTC), time.monotonic()
     display.announce(f"driving {setup.scenario.name} at stage {setup.stage.value} with {setup.solver}")
-    if setup.stage.is_lockstep:
-        recording = Recording(START_NS)
-        solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(model=DRIVE_MODEL), display.announce)
-        with _deferred_interrupt() as interrupted:
-            interruption = LockstepRun(setup, solver, recording, display.progress, interrupted.is_set).drive()
-    else:
-        recording = Recording(time.monotonic_ns())
-        interruption = RealtimeRun(setup, recording, display.announce, display.progress).drive()
-    verdict = evaluate(recording, setup.scenario, setup.vehicle, setup.stage, interruption)
-    summary = build_summary(_facts(setup, options, started, time.monotonic() - start_s), verdict, recording.samples("parameters"))
+    driven = _in_virtual_time(setup, display) if setup.stage.is_lockstep else _in_real_time(setup, display)
+    recording = driven.recording
+    verdict = evaluate(recording, setup.scenario, setup.vehicle, setup.stage, driven.interruption)
+    facts = _facts(setup, options, started, time.monotonic() - start_s, driven)
+    summary = build_summary(facts, verdict, recording.samples("parameters"), injected_faults(recording))
     (setup.directory / "summary.json").write_text(json.dumps(summary, indent=1) + "\n", encoding="utf-8")
     write_report(setup.directory / "report.html", summary, recording, setup.scenario, setup.vehicle, verdict)
     print(f"{'PASS' if verdict.passed else 'FAIL'}  {verdict.reason}")
     print(f"report: {setup.directory / 'report.html'}")
     return verdict
+
+
+def _in_virtual_time(setup: RunSetup, display: Display) -> _Driven:
+    recording = Recording(START_NS)
+    solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(model=DRIVE_MODEL), display.announce)
+    with _deferred_interrupt() as interrupted:
+        run = LockstepRun(setup, solver, recording, display.progress, interrupted.is_set)
+        start_s = time.monotonic()
+        interruption = run.drive()
+        wall_s = time.monotonic() - start_s
+    factor = run.driven_s / wall_s
+    display.announce(f"{run.driven_s:.1f} s of driving in {wall_s:.1f} s, {factor:.1f} times real time")
+    return _Driven(recording, interruption, factor, run.bus_load)
+
+
+def _in_real_time(setup: RunSetup, display: Display) -> _Driven:
+    recording = Recording(time.monotonic_ns())
+    interruption = RealtimeRun(setup, recording, display.announce, display.progress).drive()
+    names = setup.bus.names if setup.bus else {}
+    bitrate_bps = {name.partition(":")[2]: setup.catalogue.bitrate_bps[network] for network, name in names.items()}
+    return _Driven(recording, interruption, bus_load=recorded_load(setup.bus_log, bitrate_bps))
 
 
 @contextmanager
@@ -163,28 +201,38 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
     scenario = load_scenario(options.scenario)
     vehicle = load_vehicle(options.vehicle_path)
     catalogue = load(options.dbc_paths)
+    check(scenario.faults, catalogue)
+    if scenario.faults and options.stage is Stage.VEHIL:
+        raise UserMistake(f"scenario {scenario.name}: its faults are injected into the emulated car; stage vehil drives another")
     solver = options.solver or SOLVER_OF_STAGE[options.stage]
     if solver not in SOLVERS:
         raise UserMistake(f"solver {solver!r}: there are {', '.join(SOLVERS)}")
-    if options.stage is Stage.VEHIL and options.bus in ("auto", "emulated"):
-        raise UserMistake("stage vehil drives the car on a bus: name it with --bus, for example --bus socketcan:can0")
-    if options.stage.is_lockstep and (options.bus != "auto" or options.view_port is not None):
-        raise UserMistake(f"stage {options.stage.value} runs in one process in virtual time: it takes neither --bus nor --view")
-    bus = None if options.stage.is_lockstep else choose(options.bus)
+    if options.stage is Stage.VEHIL and {options.bus, options.navigation_bus} & {"auto", "emulated"}:
+        raise UserMistake("stage vehil drives the car on its buses: name them, as in --bus socketcan:can0 --navigation-bus socketcan:can1")
+    is_bus_chosen = options.bus != "auto" or options.navigation_bus is not None
+    if options.stage.is_lockstep and (is_bus_chosen or options.view_port is not None):
+        raise UserMistake(
+            f"stage {options.stage.value} runs in one process in virtual time: it takes neither --bus, --navigation-bus nor --view"
+        )
+    bus = None if options.stage.is_lockstep else choose(options.bus, options.navigation_bus)
     scenario.reference(vehicle)  # refuses a road that leaves the car no room
     GatewayCore(catalogue, vehicle, boot_id=0)  # refuses a DBC that lacks something
     library = LIBRARIES[solver](vehicle.model, OcpOptions(model=DRIVE_MODEL), display.announce) if solver in LIBRARIES else None
-    return RunSetup(
+    setup = RunSetup(
         scenario, options.stage, vehicle, catalogue, solver, library, bus, options.seed, options.out,
-        options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port,
+        options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port, options.plant, options.is_lifted,
     )  # fmt: skip
+    if options.stage is not Stage.VEHIL:
+        Emulator(setup.emulator, catalogue, START_NS, display.announce)  # refuses what it cannot emulate, and builds the car
+    return setup
 
 
 def _write_inputs(setup: RunSetup, options: DriveOptions) -> None:
     """Keep what the run was made of beside what comes out of it."""
-    scenario, copy = scenario_path(options.scenario), setup.directory / "scenario.toml"
+    scenario, copy = scenario_path(options.scenario), setup.scenario_copy
     if scenario.resolve() != copy.resolve():
         shutil.copyfile(scenario, copy)
+    setup.road_file.write_text(setup.scenario.road_surface().to_toml(), encoding="utf-8")
     setup.scenario.reference(setup.vehicle).to_csv(setup.reference_csv)
     setup.configuration.write_text(json.dumps(_configuration(setup), indent=1) + "\n", encoding="utf-8")
 
@@ -195,7 +243,9 @@ def _configuration(setup: RunSetup) -> dict[str, object]:
         "stage": setup.stage.value,
         "seed": setup.seed,
         "solver": setup.solver,
-        "bus": setup.bus.name if setup.bus else "lockstep",
+        "plant": setup.plant,
+        "is_lifted": setup.is_lifted,
+        "bus": dict(setup.bus.names) if setup.bus else "lockstep",
         "dbc": [str(path) for path in setup.dbc_paths],
         "vehicle": setup.vehicle.model_dump(),
         "ocp": asdict(OcpOptions(model=DRIVE_MODEL)),
@@ -203,10 +253,13 @@ def _configuration(setup: RunSetup) -> dict[str, object]:
     }
 
 
-def _facts(setup: RunSetup, options: DriveOptions, started: datetime, duration_s: float) -> RunFacts:
+def _facts(setup: RunSetup, options: DriveOptions, started: datetime, duration_s: float, driven: _Driven) -> RunFacts:
     files = {path.name: path for path in setup.dbc_paths}
     files |= {"vehicle": setup.vehicle_path, "scenario": scenario_path(options.scenario), "configuration": setup.configuration}
     if setup.build is not None:
         files["controller library"] = setup.build.library
     compiler = setup.build.compiler if setup.build else ""
-    return RunFacts(setup.scenario, setup.stage, setup.seed, setup.solver, started, duration_s, compiler, files)
+    return RunFacts(
+        setup.scenario, setup.stage, setup.seed, setup.solver, started, duration_s, compiler, files,
+        driven.realtime_factor, driven.bus_load,
+    )  # fmt: skip

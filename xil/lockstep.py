@@ -1,8 +1,9 @@
-"""Stages mil and sil: the same cores in one process, in virtual time, through the very bytes of the bus.
+"""Stages mil and sil: the same cores in one process, in virtual time, through the very bytes of the buses.
 
 One tick is a millisecond of the car. Every tenth tick the gateway steps, every fortieth the controller answers the state that
-the gateway has just sent; its command reaches the gateway one cycle later, as it does between processes. Nothing reads a
-clock, so that a seed determines every frame.
+the gateway has just sent; its command reaches the gateway one cycle later, as it does between processes. Between gateway and car
+frames take the time that they take on a bus: each reaches the other side with its next tick, stamped with the end of its
+transmission. Nothing reads a clock, so that a seed determines every frame.
 """
 
 from collections.abc import Callable
@@ -15,20 +16,20 @@ from dbc.errors import SetupFailure
 from dbc.frame import CanFrame
 from gateway.core import TICK_NS, GatewayCore
 from gateway.messages import PLAN_PERIOD_NS, ControlCommand, OperatorRequest
-from gateway.samples import GatewaySampler
+from gateway.samples import GatewaySampler, Process
 from gateway.telemetry import StateSample
-from vehicle_emulator.app import world_sample
-from vehicle_emulator.emulator import STEP_NS, Emulator, StartPose
+from vehicle_emulator.app import fault_sample, world_sample
+from vehicle_emulator.emulator import STEP_NS, Emulator
 from xil.buslog import BusLog
+from xil.course import Pose
 from xil.operator import Ending, Operator
 from xil.recording import Recording
 from xil.setup import RunSetup
+from xil.virtual_bus import VirtualBuses
 from xil.world import World
 
 START_NS = 1_000_000_000
 """Virtual time at which a run begins [ns]; not zero, so that a forgotten zero stands out."""
-BUS_CHANNEL = "lockstep"
-
 WORLD_PERIOD_NS = 20_000_000
 """Time between two samples of the ground truth [ns]."""
 
@@ -42,6 +43,10 @@ class LockstepRun:
 
     Args:
         options: of the controller; None for what it drives with otherwise.
+
+    Attributes:
+        driven_s: virtual time of the finished run [s].
+        bus_load: share of that time in which each bus was busy.
     """
 
     def __init__(
@@ -55,17 +60,17 @@ class LockstepRun:
         options: NmpcOptions | None = None,
     ) -> None:
         pose = setup.scenario.start_pose
-        start = StartPose(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps, 0.01 * setup.scenario.road.grade_percent)
         self._setup = setup
         self._recording = recording
         self._progress = progress
         self._is_interrupted = is_interrupted
-        self._emulator = Emulator(setup.vehicle, setup.catalogue, start, setup.seed, START_NS)
+        self._buses = VirtualBuses(setup.catalogue)
+        self._emulator = Emulator(setup.emulator, setup.catalogue, START_NS)
         self._world = World(setup.scenario, setup.vehicle, START_NS)
-        self._objects = self._world.sample(START_NS, 0, pose.x_m, pose.y_m)
+        self._objects = self._world.sample(START_NS, 0, pose)
         self._gateway = GatewayCore(setup.catalogue, setup.vehicle, _GATEWAY_BOOT_ID)
         self._nmpc = Nmpc(solver, setup.scenario.reference(setup.vehicle), setup.vehicle, _CONTROLLER_BOOT_ID, options)
-        self._operator = Operator(setup.scenario.time_limit_s)
+        self._operator = Operator(setup.scenario.time_limit_s, setup.scenario.course(setup.vehicle).is_at_end)
         self._solver_name = solver.name
         self._gateway_sampler = GatewaySampler()
         self._to_car: list[CanFrame] = []
@@ -73,6 +78,8 @@ class LockstepRun:
         self._command: ControlCommand | None = None
         self._request: OperatorRequest | None = None
         self._requests = 0
+        self.driven_s = 0.0
+        self.bus_load: dict[str, float] = {}
 
     def drive(self) -> str:
         """Drive until the operator ends the run.
@@ -84,38 +91,50 @@ class LockstepRun:
             SetupFailure: the gateway never became ready.
         """
         now_ns, ending = START_NS, None
-        with BusLog(self._setup.bus_log, BUS_CHANNEL) as log:
+        with BusLog(self._setup.bus_log) as log:
             while ending is None:
                 now_ns += STEP_NS
-                self._step_car(now_ns, log)
+                self._carry(now_ns, log)
+                self._step_car(now_ns)
                 if self._is_interrupted():
                     raise KeyboardInterrupt
                 if now_ns % TICK_NS == 0:
-                    ending = self._step_gateway(now_ns, log)
+                    ending = self._step_gateway(now_ns)
         self._progress(None)
+        self.bus_load = self._buses.load(now_ns)
+        self.driven_s = (now_ns - START_NS) / 1e9
         if ending is Ending.NEVER_READY:
             raise SetupFailure("the gateway never became ready: " + ", ".join(self._gateway.blockers))
         return "" if ending in (Ending.COMPLETED, Ending.STOPPED) else ending.value
 
-    def _step_car(self, now_ns: int, log: BusLog) -> None:
-        frames = self._emulator.step(now_ns, self._to_car)
+    def _carry(self, now_ns: int, log: BusLog) -> None:
+        """Bring what has ended on the buses by now to those who hear it, and into the record."""
+        for network, frame, is_for_gateway, is_for_car in self._buses.advance(now_ns):
+            log.write(network, frame)
+            if is_for_gateway:
+                self._to_gateway.append(frame)
+            if is_for_car:
+                self._to_car.append(frame)
+
+    def _step_car(self, now_ns: int) -> None:
+        self._buses.send(self._emulator.step(now_ns, self._to_car), now_ns)
         self._to_car = []
-        self._to_gateway += frames
-        for frame in frames:
-            log.write(frame)
+        for arbitration_id, transmissions in self._emulator.disturbances:
+            self._buses.disturb(arbitration_id, transmissions)
+        for event in self._emulator.faults.take_events():
+            self._recording.add(fault_sample(event, len(self._recording.samples("faults"))))
         if now_ns % WORLD_PERIOD_NS == 0:
             truth, seq = self._emulator.truth(), now_ns // WORLD_PERIOD_NS
             self._recording.add(world_sample(truth, now_ns, seq))
-            self._objects = self._world.sample(now_ns, seq, truth.x_m, truth.y_m)
+            car = truth.state
+            self._objects = self._world.sample(now_ns, seq, Pose(car.x_m, car.y_m, car.yaw_rad, car.vx_mps))
             if self._objects.objects:
                 self._recording.add(self._objects)
 
-    def _step_gateway(self, now_ns: int, log: BusLog) -> Ending | None:
+    def _step_gateway(self, now_ns: int) -> Ending | None:
         output = self._gateway.step(now_ns, self._to_gateway, self._command, self._request)
         self._to_gateway, self._command, self._request = [], None, None
-        self._to_car = output.frames
-        for frame in output.frames:
-            log.write(frame)
+        self._buses.send(output.frames, now_ns)
         if now_ns % PLAN_PERIOD_NS == 0:
             objects = nearest(report_of(self._objects), now_ns, output.state.x_m, output.state.y_m)
             answer = self._nmpc.step(output.state, now_ns, objects)
@@ -123,7 +142,7 @@ class LockstepRun:
             self._recording.add(command_sample(answer, self._solver_name, answer.command.solve_time_ns))
             if (plan := plan_sample(answer)) is not None:
                 self._recording.add(plan)
-        samples = self._gateway_sampler.sample(self._gateway, output, now_ns, ticks_late=0, step_cpu_ms=0.0)
+        samples = self._gateway_sampler.sample(self._gateway, output, now_ns, Process())
         for sample in samples:
             self._recording.add(sample)
         states = [sample for sample in samples if isinstance(sample, StateSample)]

@@ -69,7 +69,8 @@ class Trace:
     """The drive that a recording holds, on the times of its poses; all arrays of shape (n,).
 
     Args:
-        end_s: time from which the run is over: the judged part is behind the car and the car stands; infinite when that never was.
+        end_s: time from which the run is over: the judged part is behind the car and the car stands, or it stands for good where the
+            course ends short; infinite when that never was.
         changes: the gateway's changes of mode.
         engaged_s: first engagement; infinite when there was none.
     """
@@ -109,11 +110,17 @@ def trace(recording: Recording, course: Course, stage: Stage) -> Trace:
     )
     ay_mps2 = recording.series("world", "ay_mps2") if topic == "world" else speed_mps * recording.series("state", "yaw_rate_radps")
     along = course.project(x_m, y_m)
-    is_over = (along.station_m >= course.to_m) & (np.abs(speed_mps) < STANDSTILL_MPS)
+    stands = np.abs(speed_mps) < STANDSTILL_MPS
+    is_over = stands & (_is_last_run(stands) if course.ends_short else along.station_m >= course.to_m)
     changes = tuple(recording.mode_changes())
     engaged_s = min((change.t_s for change in changes if change.mode == Mode.ENGAGED.name), default=np.inf)
     end_s = float(t_s[np.argmax(is_over)]) if is_over.any() else np.inf
     return Trace(t_s, x_m, y_m, np.unwrap(yaw_rad), speed_mps, ay_mps2, along, changes, engaged_s, end_s)
+
+
+def _is_last_run(holds: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where a condition holds and goes on to do so to the end."""
+    return np.logical_and.accumulate(holds[::-1])[::-1]
 
 
 def evaluate(recording: Recording, scenario: Scenario, vehicle: Vehicle, stage: Stage, interruption: str = "") -> Verdict:
@@ -131,7 +138,7 @@ def evaluate(recording: Recording, scenario: Scenario, vehicle: Vehicle, stage: 
         *_control(recording, drive, course),
         *_gates(course, drive),
         *_objects(recording, scenario, course, drive),
-        *_arrival(course, drive),
+        *_arrival(recording, scenario, course, drive),
         *_tracking(scenario, course, drive),
         *_counts(recording),
     )
@@ -249,12 +256,7 @@ class Meeting:
 
 def closest(recording: Recording, name: str, course: Course, drive: Trace) -> Meeting | None:
     """The closest approach of the car to an object, of all samples of the objects; None when it never was there."""
-    found = [
-        ((sample.t_ns - recording.start_ns) * 1e-9, thing)
-        for sample in recording.samples("objects") if isinstance(sample, ObjectsSample)
-        for thing in sample.objects if thing.name == name
-    ]  # fmt: skip
-    if not found:
+    if not (found := _seen(recording, name)):
         return None
     times_s = np.array([t_s for t_s, _ in found])
     car = course.outline.corners_m(*(np.interp(times_s, drive.t_s, values) for values in (drive.x_m, drive.y_m, drive.yaw_rad)))
@@ -264,15 +266,40 @@ def closest(recording: Recording, name: str, course: Course, drive: Trace) -> Me
     return Meeting(name, float(times_s[k]), float(clearance_m[k]), boxes[k])
 
 
+def _seen(recording: Recording, name: str) -> list[tuple[float, WorldObject]]:
+    """An object at the times at which it was there."""
+    return [
+        ((sample.t_ns - recording.start_ns) * 1e-9, thing)
+        for sample in recording.samples("objects") if isinstance(sample, ObjectsSample)
+        for thing in sample.objects if thing.name == name
+    ]  # fmt: skip
+
+
+def _final_gap_m(recording: Recording, name: str, course: Course, drive: Trace) -> float | None:
+    """Distance along the course from the car's front to an object, at the end; None when it never was there."""
+    if not (found := _seen(recording, name)):
+        return None
+    car = course.outline.corners_m(drive.x_m[-1:], drive.y_m[-1:], drive.yaw_rad[-1:])[0]
+    box = _corners_m(found[-1][1])[0]
+    return float(course.project(*box.T).station_m.min() - course.project(*car.T).station_m.max())
+
+
 def _corners_m(thing: WorldObject) -> Array:
     outline = Outline(0.5 * thing.length_m, 0.5 * thing.length_m, 0.5 * thing.width_m)
     return outline.corners_m(*(np.array([value]) for value in (thing.x_m, thing.y_m, thing.yaw_rad)))
 
 
-def _arrival(course: Course, drive: Trace) -> Iterator[Metric]:
+def _arrival(recording: Recording, scenario: Scenario, course: Course, drive: Trace) -> Iterator[Metric]:
     reached_m, final_mps = float(drive.along.station_m.max()), abs(float(drive.speed_mps[-1]))
-    short = f"not completed: the car got to {reached_m:.1f} m in {drive.t_s[-1]:.1f} s, it was to pass {course.to_m:.1f} m"
-    yield _at_least("station reached", reached_m, "m", course.to_m, short)
+    if (name := scenario.judge.stands_before) is None:
+        short = f"not completed: the car got to {reached_m:.1f} m in {drive.t_s[-1]:.1f} s, it was to pass {course.to_m:.1f} m"
+        yield _at_least("station reached", reached_m, "m", course.to_m, short)
+    else:
+        yield Metric("station reached", reached_m, "m")
+        gap_m, limit_m = _final_gap_m(recording, name, course, drive), scenario.judge.stands_within_m
+        far = "" if gap_m is None else f"the car ended {gap_m:.1f} m before {name}, it was to stand within {limit_m:g} m"
+        yield _at_most(f"final distance to {name}", gap_m, "m", limit_m, far)
+        yield _at_least(f"stands before {name}", gap_m, "m", 0.0, f"the car was to stand before {name}, it ended beside or behind it")
     rolling = f"the car still rolled at {final_mps:.2f} m/s when the run ended, after {drive.t_s[-1]:.1f} s"
     yield _at_most("final speed", final_mps, "m/s", STANDSTILL_MPS, rolling)
     room_m = np.minimum(drive.along.left_m - drive.along.lateral_error_m, drive.along.right_m + drive.along.lateral_error_m)

@@ -1,6 +1,7 @@
 """The operator of a run: engages when the gateway is ready, ends the run when it is over. Pure; fed with telemetry."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -10,7 +11,9 @@ from gateway.telemetry import StateSample
 STANDSTILL_MPS = 0.1
 """Below the speed that the verdict calls standing, so that a run that is over has also ended well."""
 SETTLE_S = 0.5
-"""How long the car must stand before the run is over."""
+"""How long the car must stand at the end before the run is over."""
+PATIENCE_S = 8.0
+"""How long it must stand before that: what is in its way may move on, as a pedestrian who walks across does."""
 MIN_DISTANCE_M = 2.0
 """A car that has not moved this far since it was engaged has not driven yet."""
 READY_TIMEOUT_S = 20.0
@@ -19,7 +22,7 @@ READY_TIMEOUT_S = 20.0
 class Ending(Enum):
     """How a run ended."""
 
-    COMPLETED = "the car stands at the end"
+    COMPLETED = "the car stands for good"
     STOPPED = "the gateway ended the drive"
     TIME_LIMIT = "time limit reached"
     NEVER_READY = "the gateway never became ready"
@@ -38,14 +41,16 @@ class Operator:
 
     Args:
         time_limit_s: longest drive after engagement [s].
+        is_at_end: whether a place (x, y) [m] is one where the drive may end.
 
     Attributes:
         has_engaged: whether the car was ever engaged.
         distance_m: way driven since the engagement [m].
     """
 
-    def __init__(self, time_limit_s: float) -> None:
+    def __init__(self, time_limit_s: float, is_at_end: Callable[[float, float], bool]) -> None:
         self._time_limit_s = time_limit_s
+        self._is_at_end = is_at_end
         self._start_ns: int | None = None
         self._engaged_ns = 0
         self._standing_since_ns: int | None = None
@@ -62,8 +67,8 @@ class Operator:
             return self._before_engagement(now_ns, state)
         self._follow(state)
         if state.mode != Mode.ENGAGED.name:
-            return Advice(ending=Ending.STOPPED) if self._is_settled(now_ns, state) or self._is_late(now_ns) else Advice()
-        if self._is_settled(now_ns, state) and self.distance_m > MIN_DISTANCE_M:
+            return Advice(ending=Ending.STOPPED) if self._has_stood(SETTLE_S, now_ns, state) or self._is_late(now_ns) else Advice()
+        if self.distance_m > MIN_DISTANCE_M and self._is_over(now_ns, state):
             return Advice(Operation.DISENGAGE, Ending.COMPLETED)
         if self._is_late(now_ns):
             return Advice(Operation.DISENGAGE, Ending.TIME_LIMIT)
@@ -88,9 +93,13 @@ class Operator:
         elif self._standing_since_ns is None:
             self._standing_since_ns = state.t_ns
 
-    def _is_settled(self, now_ns: int, state: StateSample) -> bool:
-        """Whether the car has stood long enough; a state that is not valid says nothing about standing."""
-        return state.is_valid and self._standing_since_ns is not None and now_ns - self._standing_since_ns > SETTLE_S * 1e9
+    def _is_over(self, now_ns: int, state: StateSample) -> bool:
+        is_there = self._has_stood(SETTLE_S, now_ns, state) and self._is_at_end(state.x_m, state.y_m)
+        return is_there or self._has_stood(PATIENCE_S, now_ns, state)
+
+    def _has_stood(self, duration_s: float, now_ns: int, state: StateSample) -> bool:
+        """Whether the car has stood so long; a state that is not valid says nothing about standing."""
+        return state.is_valid and self._standing_since_ns is not None and now_ns - self._standing_since_ns > duration_s * 1e9
 
     def _is_late(self, now_ns: int) -> bool:
         return now_ns - self._engaged_ns > self._time_limit_s * 1e9

@@ -10,12 +10,14 @@ from pathlib import Path
 
 import msgspec
 
+from dbc.catalogue import NAVIGATION, ROBOTS
 from dbc.errors import SetupFailure
 from gateway.channel import Channel
 from gateway.messages import Mode, OperatorRequest
 from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, WorldSample, decode, new_boot_id, port_of
 from vehicle_emulator.bus.channel import is_served
 from xil.buslog import BusListener
+from xil.course import Pose
 from xil.operator import STANDSTILL_MPS, Advice, Ending, Operator
 from xil.processes import Death, Processes
 from xil.recording import Recording
@@ -123,24 +125,27 @@ class RealtimeRun:
         vehicle = ["--vehicle", str(setup.vehicle_path)]
         contract = [*vehicle, *(argument for path in setup.dbc_paths for argument in ("--dbc", str(path))), *telemetry]
         sockets = ["--gateway-socket", str(gateway_socket), "--controller-socket", str(controller_socket)]
-        if (channel := bus.hub_channel) is not None:
-            processes.start("bus", ["bus", channel])
-            self._await(processes, "bus", lambda: is_served(channel))
-        stack.enter_context(BusListener(bus.name, setup.bus_log))
+        if channels := bus.hub_channels:
+            bitrates = [argument for network in channels for argument in ("--bitrate", str(setup.catalogue.bitrate_bps[network]))]
+            processes.start("bus", ["bus", *channels.values(), *bitrates])
+            self._await(processes, "bus", lambda: all(map(is_served, channels.values())))
+        stack.enter_context(BusListener(bus.names.values(), setup.bus_log))
+        buses = ["--bus", bus.names[ROBOTS], "--navigation-bus", bus.names[NAVIGATION]]
         if setup.view_port is not None:
             processes.start("view", ["view", "--port", str(setup.view_port), *telemetry])
             self._announce(f"virtual world: http://127.0.0.1:{setup.view_port}/")
-        processes.start("gateway", ["gateway", "--bus", bus.name, *contract, *sockets])
+        processes.start("gateway", ["gateway", *buses, *contract, *sockets])
         reference = ["--reference", str(setup.reference_csv), "--solver", setup.solver]
         processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets])
         # The car starts last: in a rolling start every second counts that the others take to come up.
         self._await(processes, "gateway", lambda: self._recording.latest("status") is not None)
         self._await(processes, "controller", controller_socket.exists)
         if setup.stage is Stage.HIL:
-            pose, grade_percent = setup.scenario.start_pose, setup.scenario.road.grade_percent
+            pose = setup.scenario.start_pose
             start = ["--x-m", str(pose.x_m), "--y-m", str(pose.y_m), "--yaw-rad", str(pose.yaw_rad), "--speed-mps", str(pose.speed_mps)]
-            start += ["--grade-percent", str(grade_percent)]
-            processes.start("emulator", ["emulator", "--bus", bus.name, *start, "--seed", str(setup.seed), *contract])
+            start += ["--road", str(setup.road_file), "--plant", setup.plant, "--lifted" if setup.is_lifted else "--on-the-road"]
+            start += ["--faults", str(setup.scenario_copy)] if setup.scenario.faults else []
+            processes.start("emulator", ["emulator", *buses, *start, "--seed", str(setup.seed), *contract])
             self._await(processes, "emulator", lambda: self._recording.latest("world") is not None)
 
     def _await(self, processes: Processes, name: str, is_up: Callable[[], bool]) -> None:
@@ -155,7 +160,7 @@ class RealtimeRun:
     def _operate(self, processes: Processes, channel: Channel, scene: Publisher, objects: Publisher | None) -> str:
         """Play the operator until the run is over; why it was cut short, or nothing."""
         world = World(self._setup.scenario, self._setup.vehicle, time.monotonic_ns())
-        operator = Operator(self._setup.scenario.time_limit_s)
+        operator = Operator(self._setup.scenario.time_limit_s, self._setup.scenario.course(self._setup.vehicle).is_at_end)
         ending, seen, last_news_s = None, 0, time.monotonic()
         try:
             while ending is None:
@@ -205,7 +210,7 @@ class RealtimeRun:
         if now_ns >= self._next_objects_ns and isinstance(car, WorldSample | StateSample):
             self._next_objects_ns = max(self._next_objects_ns + OBJECTS_PERIOD_NS, now_ns)
             self._objects_seq += 1
-            publisher.post(world.sample(now_ns, self._objects_seq, car.x_m, car.y_m))
+            publisher.post(world.sample(now_ns, self._objects_seq, Pose(car.x_m, car.y_m, car.yaw_rad, car.vx_mps)))
 
     def _note_deaths(self, processes: Processes) -> None:
         for death in processes.deaths():

@@ -4,21 +4,23 @@ The base line of a scenario starts at (`path.start_m`, 0) and heads along x. Eve
 along the base line, so that on a straight base line a station is the x coordinate. Lateral positions are left positive.
 """
 
-import re
-import tomllib
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import ErrorDetails, PydanticCustomError
+from pydantic import Field, model_validator
 
 from controller.planning.reference import ReferencePath
 from dbc.errors import UserMistake
+from dbc.section import Section, between, misfit, read_section
 from dbc.vehicle import Vehicle
 from gateway.telemetry import Lane, SceneSample
+from vehicle_emulator.faults.spec import Faults
+from vehicle_emulator.road import RoadDescription
 from xil.course import SPACING_M, Array, Course, Outline, Pose, blend, fine_stations, integrate
+from xil.scenario_objects import Acceleration, Lateral, RoadObject, Station
+from xil.scenario_road import Road
 
 SCENARIO_FOLDER = Path(__file__).with_name("scenarios")
 
@@ -28,7 +30,6 @@ LAUNCH_MPS = 1.0
 """Speed at the start of a reference that begins at standstill: a car on a path at zero speed would never leave."""
 
 _SCENE_SPACING_M = 1.0
-_TOML_LINE = re.compile(r"at line (\d+)")
 
 
 class ScenarioError(UserMistake):
@@ -54,26 +55,10 @@ class Stage(StrEnum):
         return "state" if self is Stage.VEHIL else "world"
 
 
-def _between(low: float, high: float) -> AfterValidator:
-    def check(value: float) -> float:
-        if not low <= value <= high:
-            raise PydanticCustomError("range", "allowed: {low} to {high}", {"low": f"{low:g}", "high": f"{high:g}"})
-        return value
-
-    return AfterValidator(check)
+Limit = Annotated[float, between(0.0, 100.0)]
 
 
-Station = Annotated[float, _between(-10_000.0, 10_000.0)]
-Lateral = Annotated[float, _between(-20.0, 20.0)]
-Acceleration = Annotated[float, _between(0.1, 10.0)]
-Limit = Annotated[float, _between(0.0, 100.0)]
-
-
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
-
-
-class Start(_Section):
+class Start(Section):
     """The emulated car at the start of the path when the run begins, rolling or standing.
 
     Args:
@@ -81,17 +66,17 @@ class Start(_Section):
     """
 
     offset_m: Lateral
-    speed_kmh: Annotated[float, _between(0.0, 250.0)]
+    speed_kmh: Annotated[float, between(0.0, 250.0)]
 
 
-class SpeedPlan(_Section):
+class SpeedPlan(Section):
     """Cruise, after an acceleration where the start is slower, and the stop that ends every run.
 
     Args:
         stop_m: station at which the car is to stand.
     """
 
-    cruise_kmh: Annotated[float, _between(5.0, 250.0)]
+    cruise_kmh: Annotated[float, between(5.0, 250.0)]
     acceleration_mps2: Acceleration | None = None
     deceleration_mps2: Acceleration
     stop_m: Station
@@ -107,7 +92,7 @@ class SpeedPlan(_Section):
         return self.stop_m - self.cruise_mps**2 / (2.0 * self.deceleration_mps2)
 
 
-class Curve(_Section):
+class Curve(Section):
     """A stretch of constant curvature between two transitions over which the curvature changes smoothly.
 
     Args:
@@ -117,15 +102,15 @@ class Curve(_Section):
 
     start_m: Station
     end_m: Station
-    radius_m: Annotated[float, _between(-10_000.0, 10_000.0)]
-    transition_m: Annotated[float, _between(5.0, 500.0)]
+    radius_m: Annotated[float, between(-10_000.0, 10_000.0)]
+    transition_m: Annotated[float, between(5.0, 500.0)]
 
     @model_validator(mode="after")
     def _is_drivable(self) -> Self:
         if self.end_m - self.start_m < 2.0 * self.transition_m:
-            raise PydanticCustomError("fit", "allowed: end_m at least twice transition_m behind start_m")
+            raise misfit("end_m at least twice transition_m behind start_m")
         if abs(self.radius_m) < 10.0:
-            raise PydanticCustomError("fit", "allowed: radius_m of at least 10, or at most -10")
+            raise misfit("radius_m of at least 10, or at most -10")
         return self
 
     def curvature_radpm(self, station_m: Array) -> Array:
@@ -135,11 +120,11 @@ class Curve(_Section):
         return (rise - fall) / self.radius_m
 
 
-class Shift(_Section):
+class Shift(Section):
     """A lateral move of the reference along a quintic: position, heading and curvature stay continuous."""
 
     start_m: Station
-    length_m: Annotated[float, _between(1.0, 1_000.0)]
+    length_m: Annotated[float, between(1.0, 1_000.0)]
     offset_m: Lateral
 
     def offset_and_slope(self, station_m: Array) -> tuple[Array, Array]:
@@ -148,79 +133,39 @@ class Shift(_Section):
         return self.offset_m * value, self.offset_m / self.length_m * slope
 
 
-class PathPlan(_Section):
+class PathPlan(Section):
     """The line to drive: curves of the base line, and lateral shifts from it, which add up."""
 
     start_m: Station
-    curves: list[Curve] = []
-    shifts: list[Shift] = []
+    curves: list[Curve] = Field(default_factory=list)
+    shifts: list[Shift] = Field(default_factory=list)
 
 
-class Road(_Section):
-    """Distance from the base line to the edges of the road, and how it climbs along the drive."""
-
-    left_m: Annotated[float, _between(0.5, 100.0)]
-    right_m: Annotated[float, _between(0.5, 100.0)]
-    grade_percent: Annotated[float, _between(-20.0, 20.0)] = 0.0
-
-
-class RoadObject(_Section):
-    """A box on the ground, that stands or drives straight on at one speed; it is there and drives from its appearance on.
-
-    Args:
-        station_m, offset_m: its centre when it appears.
-        heading_deg: from the direction of the base line there, left positive.
-        speed_kmh: along its heading.
-        appears_at_m: station at which the car then is.
-        appears_at_s: time since the start of the run. Without both it is there from the start.
-    """
-
-    name: Annotated[str, Field(min_length=1, max_length=80)]
-    station_m: Station
-    offset_m: Lateral
-    length_m: Annotated[float, _between(0.1, 50.0)]
-    width_m: Annotated[float, _between(0.1, 50.0)]
-    heading_deg: Annotated[float, _between(-180.0, 180.0)] = 0.0
-    speed_kmh: Annotated[float, _between(0.0, 250.0)] = 0.0
-    appears_at_m: Station | None = None
-    appears_at_s: Annotated[float, _between(0.0, 600.0)] | None = None
-
-    @model_validator(mode="after")
-    def _appears_once(self) -> Self:
-        if self.appears_at_m is not None and self.appears_at_s is not None:
-            raise PydanticCustomError("fit", "allowed: one of appears_at_m and appears_at_s")
-        return self
-
-    def is_due(self, t_s: float, reached_m: float) -> bool:
-        """Whether it is there, at a time since the start and with the car having got to a station."""
-        if self.appears_at_m is not None:
-            return reached_m >= self.appears_at_m
-        return t_s >= (self.appears_at_s or 0.0)
-
-
-class Gate(_Section):
+class Gate(Section):
     """A lane of cones along x, `car_widths` times the car's width plus `margin_m` wide."""
 
     name: str
     start_m: Station
     end_m: Station
     centre_m: Lateral
-    car_widths: Annotated[float, _between(1.0, 5.0)]
-    margin_m: Annotated[float, _between(0.0, 5.0)]
+    car_widths: Annotated[float, between(1.0, 5.0)]
+    margin_m: Annotated[float, between(0.0, 5.0)]
 
     @model_validator(mode="after")
     def _runs_forward(self) -> Self:
         if self.end_m <= self.start_m:
-            raise PydanticCustomError("fit", "allowed: end_m greater than start_m")
+            raise misfit("end_m greater than start_m")
         return self
 
 
-class Judgement(_Section):
+class Judgement(Section):
     """Where the drive is judged, and its limits; a figure without a limit is shown, not judged.
 
     Args:
         from_m, to_m: stations between which tracking is judged; the car must get past `to_m`.
         object_clearance_m: least distance from the car's outline to an object.
+        stands_before: name of the object before which the car is to stand for good; it then need not get past `to_m`.
+        stands_within_m: largest distance from there to that object.
     """
 
     from_m: Station
@@ -232,20 +177,23 @@ class Judgement(_Section):
     speed_error_rms_mps: Limit | None = None
     lateral_acceleration_max_mps2: Limit | None = None
     object_clearance_m: Limit = 0.0
+    stands_before: str | None = None
+    stands_within_m: Limit = 10.0
 
 
-class Scenario(_Section):
+class Scenario(Section):
     """One drive: where, how fast, between what, and what counts as good."""
 
     name: str
     description: str
-    time_limit_s: Annotated[float, _between(1.0, 600.0)]
+    time_limit_s: Annotated[float, between(1.0, 600.0)]
     start: Start
     speed: SpeedPlan
     path: PathPlan
     road: Road
-    gates: list[Gate] = []
-    objects: list[RoadObject] = []
+    gates: list[Gate] = Field(default_factory=list)
+    objects: list[RoadObject] = Field(default_factory=list)
+    faults: Faults = ()
     judge: Judgement
 
     @model_validator(mode="after")
@@ -260,16 +208,24 @@ class Scenario(_Section):
             (bool(self.gates and self.path.curves), "gates only on a straight base line, without path.curves"),
             (any(g.start_m < start_m or g.end_m > judge.to_m for g in self.gates), "gates only between path.start_m and judge.to_m"),
             (len({thing.name for thing in self.objects}) < len(self.objects), "objects only with names that differ"),
+            (
+                judge.stands_before not in (None, *(thing.name for thing in self.objects)),
+                "judge.stands_before only with the name of an object",
+            ),
             (any(not start_m <= thing.station_m <= end_m for thing in self.objects), f"objects only from path.start_m to {end_m:g}"),
         ):
             if is_wrong:
-                raise PydanticCustomError("fit", "allowed: {rule}", {"rule": rule})
+                raise misfit(rule)
         return self
 
     @property
     def start_pose(self) -> Pose:
         """Where the emulated car is when the run begins."""
         return Pose(self.path.start_m, self.start.offset_m, 0.0, self.start.speed_kmh / 3.6)
+
+    def road_surface(self) -> RoadDescription:
+        """Height and grip of the road."""
+        return self.road.surface(self.path.start_m)
 
     def lanes(self, vehicle: Vehicle) -> list[Lane]:
         """The gates, as wide as this car has them."""
@@ -307,9 +263,10 @@ class Scenario(_Section):
             right_m=right_m,
         )
         return Course(
-            line.station_m, reference, line.beside_m(self.road.left_m), line.beside_m(-self.road.right_m),
+            line, reference, line.beside_m(self.road.left_m), line.beside_m(-self.road.right_m),
             self.lanes(vehicle), Outline.of(vehicle), self.judge.from_m, self.judge.to_m,
-        )
+            self.judge.stands_before is not None,
+        )  # fmt: skip
 
     def _speed_mps(self, station_m: Array) -> Array:
         plan, start_mps = self.speed, max(self.start.speed_kmh / 3.6, LAUNCH_MPS)
@@ -371,31 +328,4 @@ def load_scenario(name_or_path: str) -> Scenario:
     Raises:
         ScenarioError: unknown name, missing file, malformed TOML, unknown or missing key, value out of range.
     """
-    path = scenario_path(name_or_path)
-    try:
-        text = path.read_text(encoding="utf-8")
-        return Scenario.model_validate(tomllib.loads(text))
-    except OSError as error:
-        raise ScenarioError(f"{path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{path}: not valid TOML: {error}{_quoted_line(text, str(error))}") from error
-    except ValidationError as error:
-        raise ScenarioError("\n".join(_mistake(path, details) for details in error.errors())) from error
-
-
-def _quoted_line(text: str, message: str) -> str:
-    found = _TOML_LINE.search(message)
-    return f": {text.splitlines()[int(found.group(1)) - 1].strip()}" if found else ""
-
-
-def _mistake(path: Path, details: ErrorDetails) -> str:
-    key = ".".join(map(str, details["loc"])) or "scenario"
-    if details["type"] == "missing":
-        return f"{path}: {key}: missing"
-    if details["type"] == "extra_forbidden":
-        return f"{path}: {key}: unknown key"
-    value: Any = details["input"]
-    shown = "" if isinstance(value, dict | list) else f" = {value!r}"
-    return f"{path}: {key}{shown}: {details['msg']}"
+    return read_section(scenario_path(name_or_path), Scenario, ScenarioError)

@@ -6,6 +6,7 @@ from pathlib import Path
 from dbc.build import Build
 from dbc.catalogue import Catalogue
 from dbc.vehicle import Vehicle
+from vehicle_emulator.emulator import DEFAULT_PLANT, EmulatorSetup, StartPose
 from xil.bus import BusChoice
 from xil.scenario import Scenario, Stage
 
@@ -16,9 +17,10 @@ class RunSetup:
 
     Args:
         build: the compiled controller, or None for the uncompiled solver.
-        bus: the bus of a real-time stage, None in lockstep.
+        bus: the buses of a real-time stage, None in lockstep.
         view_port: port of the virtual world's page, or None.
         directory: where the run leaves its files.
+        plant, is_lifted: of the emulated car, see `vehicle_emulator.emulator.EmulatorSetup`.
     """
 
     scenario: Scenario
@@ -34,11 +36,37 @@ class RunSetup:
     vehicle_path: Path
     view_port: int | None
     telemetry_base_port: int
+    plant: str = DEFAULT_PLANT
+    is_lifted: bool = False
+
+    @property
+    def emulator(self) -> EmulatorSetup:
+        """What the emulator emulates."""
+        pose = self.scenario.start_pose
+        return EmulatorSetup(
+            vehicle=self.vehicle,
+            start=StartPose(pose.x_m, pose.y_m, pose.yaw_rad, pose.speed_mps),
+            road=self.scenario.road_surface(),
+            plant=self.plant,
+            is_lifted=self.is_lifted,
+            faults=self.scenario.faults,
+            seed=self.seed,
+        )
 
     @property
     def bus_log(self) -> Path:
         """The bus record."""
         return self.directory / "bus.log"
+
+    @property
+    def scenario_copy(self) -> Path:
+        """The scenario, as it was when the run began."""
+        return self.directory / "scenario.toml"
+
+    @property
+    def road_file(self) -> Path:
+        """The surface of the road, as the emulator reads it."""
+        return self.directory / "road.toml"
 
     @property
     def configuration(self) -> Path:

@@ -5,7 +5,7 @@ import os
 import platform
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 
 from gateway.telemetry import Sample
+from xil.injected import InjectedFault
 from xil.metrics import Metric, Verdict
 from xil.scenario import Scenario, Stage
 
@@ -36,6 +37,8 @@ class RunFacts:
         started: when, with time zone.
         compiler: which compiler made the controller library; empty for the uncompiled solver.
         files: everything whose content decides on the run, by what it is: controller library, DBC files, vehicle, scenario, configuration.
+        realtime_factor: how many times faster than real time the drive was; None where it was in real time.
+        bus_load: share of the time in which each bus was busy, by the channel of the bus record; empty of a run that recorded nothing.
     """
 
     scenario: Scenario
@@ -46,15 +49,20 @@ class RunFacts:
     duration_s: float
     compiler: str
     files: Mapping[str, Path]
+    realtime_factor: float | None = None
+    bus_load: Mapping[str, float] = field(default_factory=dict)
 
 
-def build_summary(facts: RunFacts, verdict: Verdict, parameter_changes: Sequence[Sample]) -> dict[str, Any]:
+def build_summary(
+    facts: RunFacts, verdict: Verdict, parameter_changes: Sequence[Sample], faults: Sequence[InjectedFault]
+) -> dict[str, Any]:
     """The content of `summary.json`, made of what JSON can carry.
 
     `metrics` are what a seed determines in lockstep, `timing` what the machine determines; both are judged.
 
     Args:
         parameter_changes: samples of the topic `parameters`: what somebody tuned while it drove.
+        faults: that were injected.
 
     Raises:
         OSError: a file of the run cannot be read.
@@ -69,12 +77,15 @@ def build_summary(facts: RunFacts, verdict: Verdict, parameter_changes: Sequence
         "reason": verdict.reason,
         "started": facts.started.astimezone(UTC).isoformat(timespec="seconds"),
         "duration_s": round(facts.duration_s, 3),
+        "realtime_factor": None if facts.realtime_factor is None else round(facts.realtime_factor, 2),
+        "bus_load": {network: round(load, 5) for network, load in facts.bus_load.items()},
         "versions": versions(),
         "git_revision": git_revision(Path(__file__).parent),
         "compiler": facts.compiler,
         "machine": machine(),
         "sha256": {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in facts.files.items()},
         "parameter_changes": [msgspec.to_builtins(change) for change in parameter_changes],
+        "faults": [asdict(fault) for fault in faults],
         "metrics": _as_data(verdict.metrics),
         "timing": _as_data(verdict.timing),
     }

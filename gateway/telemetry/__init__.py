@@ -25,6 +25,7 @@ from dbc.errors import SetupFailure
 from gateway.telemetry.samples import (
     TOPICS,
     CommandSample,
+    FaultSample,
     Lane,
     ObjectsSample,
     ParameterChange,
@@ -49,6 +50,7 @@ __all__ = [
     "MAX_REQUEST_BYTES",
     "TOPICS",
     "CommandSample",
+    "FaultSample",
     "Lane",
     "ObjectsSample",
     "ParameterChange",

@@ -150,6 +150,7 @@ class StatusSample(Sample, frozen=True, kw_only=True):
     Args:
         reason: why the mode is what it is, for people.
         blockers: what keeps the gateway from the next mode; empty when it may engage.
+        dead_buses: networks whose bus refuses to deliver or to accept frames.
     """
 
     mode: str
@@ -162,6 +163,7 @@ class StatusSample(Sample, frozen=True, kw_only=True):
     ticks: int
     ticks_late: int
     step_cpu_ms: float
+    dead_buses: list[str] = []
 
 
 class WorldObject(msgspec.Struct, frozen=True, kw_only=True):
@@ -178,10 +180,19 @@ class WorldObject(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WorldSample(Sample, frozen=True, kw_only=True):
-    """Ground truth of the emulated car at its centre of gravity."""
+    """Ground truth of the emulated car at its centre of gravity; wheels front left, front right, rear left, rear right.
+
+    Args:
+        z_m, roll_rad, pitch_rad: roll to the right and pitch nose down are positive.
+        is_lifted: whether the car hangs on a lift; steering, wheels, engine and gear are then those of the car that hangs there, and
+            the motion is that of a virtual one.
+    """
 
     x_m: float
     y_m: float
+    z_m: float = 0.0
+    roll_rad: float = 0.0
+    pitch_rad: float = 0.0
     yaw_rad: float
     vx_mps: float
     vy_mps: float
@@ -191,7 +202,27 @@ class WorldSample(Sample, frozen=True, kw_only=True):
     sr_angle_rad: float
     ar_position_norm: float
     br_position_norm: float
+    wheel_speeds_radps: list[float] = []
+    engine_speed_radps: float = 0.0
+    gear: int = 0
     robots_engaged: bool
+    is_lifted: bool = False
+
+
+class FaultSample(Sample, frozen=True, kw_only=True):
+    """An injected fault began or ended.
+
+    Args:
+        name: of the fault.
+        what: the fault as it was asked for.
+        event: begins, ends, or cleared when somebody took it back before its end.
+        hits: frames that it has hit so far.
+    """
+
+    name: str
+    what: str
+    event: str
+    hits: int
 
 
 class ObjectsSample(Sample, frozen=True, kw_only=True):
@@ -236,6 +267,7 @@ TOPICS: dict[str, tuple[Source, type[Sample]]] = {
     "profile": (Source.CONTROLLER, ProfileSample),
     "parameters": (Source.CONTROLLER, ParametersSample),
     "world": (Source.EMULATOR, WorldSample),
+    "faults": (Source.EMULATOR, FaultSample),
     "scene": (Source.RUNNER, SceneSample),
     "objects": (Source.WORLD, ObjectsSample),
 }

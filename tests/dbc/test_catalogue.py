@@ -14,6 +14,7 @@ from dbc.frame import CanFrame
 CATALOGUE = load()
 MESSAGES = [m for path in (ROBOTS_DBC, GNSS_IMU_DBC) for m in cantools.database.load_file(str(path)).messages]
 SIGNALS = [(m, s) for m in MESSAGES for s in m.signals]
+SITE_DBC = 'VERSION ""\nBU_: A\nBO_ 1 X: 8 A\n SG_ S : 0|8@1+ (1,0) [0|255] "" A\n'
 PROTECTED = [s.name for s in CATALOGUE.by_name.values() if s.e2e_data_id is not None]
 
 
@@ -22,12 +23,14 @@ def frame_of(name, payload):
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: m.name)
-def test_every_message_is_cyclic_and_supervised(message):
+def test_every_message_that_is_sent_is_cyclic_and_supervised(message):
     spec = CATALOGUE.by_name[message.name]
     assert spec.arbitration_id == message.frame_id
-    assert spec.cycle_time_ns > 0
     assert spec.timeout_ns >= 3 * spec.cycle_time_ns
-    assert spec.sender in ("GW", "RC", "SR", "AR", "BR", "INS")
+    assert spec.sender in ("GW", "RC", "SR", "AR", "BR", "CAR", "INS")
+    # What the navigation system could send as well is described, but has no cycle time.
+    assert (spec.cycle_time_ns > 0) == (spec.timeout_ns > 0)
+    assert spec.cycle_time_ns > 0 or spec.sender == "INS"
 
 
 @pytest.mark.parametrize(("message", "signal"), SIGNALS, ids=lambda x: x.name)
@@ -69,6 +72,20 @@ def test_value_out_of_range_is_rejected():
         CATALOGUE.decode(CATALOGUE.by_name["AR_Status"], frame_of("AR_Status", b"\x00\x00\xff\xff\x00\x00\x00\x00"))
 
 
+def test_a_multiplexed_message_carries_the_page_of_its_signals():
+    spec = CATALOGUE.by_name["RC_FaultReport"]
+
+    def decoded(values):
+        return CATALOGUE.decode(spec, frame_of("RC_FaultReport", CATALOGUE.encode("RC_FaultReport", values)))
+
+    # 460 deg = 4600 * 0.1 = 0x11F8 from bit 8, 60 Nm = 600 * 0.1 = 0x0258 from bit 40.
+    assert CATALOGUE.encode("RC_FaultReport", {"Page": 1, "MaxAngle": 460.0, "MaxTorque": 60.0}).hex() == "01f8110000580200"
+    assert decoded({"BrStroke": 150.0}) == {"Page": 3, "BrStroke": 150.0, "BrMaxForce": 0.0}
+    assert set(decoded({})) == {"Page", "Robot", "Active", "Latched", "Dtc", "Count", "TimeStamp"}
+    with pytest.raises(DecodeError, match="multiplexer"):
+        CATALOGUE.decode(spec, frame_of("RC_FaultReport", b"\x09" + bytes(7)))
+
+
 def test_unknown_signal_is_named():
     with pytest.raises(EncodeError, match="Angel"):
         CATALOGUE.encode("SR_Command", {"Angel": 1})
@@ -95,6 +112,45 @@ def test_missing_dbc_and_clash(tmp_path):
         load([tmp_path / "nowhere.dbc"])
     with pytest.raises(CatalogueError, match="defined twice"):
         load([ROBOTS_DBC, ROBOTS_DBC])
+
+
+@pytest.mark.parametrize(
+    ("attributes", "network", "bitrate_bps"),
+    [
+        ("", "robots", 500_000),
+        ('BA_ "BusName" "navigation";\n', "navigation", 500_000),
+        ('BA_ "BusName" "robots";\nBA_ "Baudrate" 1000000;\n', "robots", 1_000_000),
+        ('BA_DEF_DEF_ "Baudrate" 250000;\n', "robots", 250_000),
+    ],
+)
+def test_a_file_says_which_bus_it_is_about(tmp_path, attributes, network, bitrate_bps):
+    path = tmp_path / "site.dbc"
+    path.write_text(f'{SITE_DBC}BA_DEF_ "BusName" STRING ;\nBA_DEF_ "Baudrate" INT 0 9000000;\n{attributes}')
+    catalogue = load([path])
+    assert catalogue.by_name["X"].network == network
+    assert catalogue.bitrate_bps == {"robots": 500_000, "navigation": 500_000} | {network: bitrate_bps}
+
+
+def test_robots_and_navigation_system_are_on_buses_of_their_own():
+    assert {(spec.sender, spec.network) for spec in CATALOGUE.by_name.values()} == {
+        *((sender, "robots") for sender in ("GW", "RC", "SR", "AR", "BR", "CAR")),
+        ("INS", "navigation"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("attributes", "named"),
+    [
+        ('BA_ "BusName" "Chassis";\n', r"site\.dbc: BusName 'Chassis': expected robots or navigation$"),
+        ('BA_ "Baudrate" 2000000;\n', r"site\.dbc: Baudrate 2000000 outside \[1, 1000000\]$"),
+        ('BA_ "Baudrate" 250000;\n', r"site\.dbc: Baudrate 250000: another file gives bus robots 500000 bit/s$"),
+    ],
+)
+def test_a_bus_that_cannot_be_is_one_line(tmp_path, attributes, named):
+    path = tmp_path / "site.dbc"
+    path.write_text(f'{SITE_DBC}BA_DEF_ "BusName" STRING ;\nBA_DEF_ "Baudrate" INT 0 9000000;\n{attributes}')
+    with pytest.raises(CatalogueError, match=named):
+        load([ROBOTS_DBC, path])
 
 
 def test_protection_without_data_id_is_refused(tmp_path):

@@ -1,4 +1,4 @@
-"""The link on every kind of bus: same frames, never an exception, and a dead bus that shows."""
+"""The link on every kind of bus: same frames, never an exception, and a dead bus that shows; and several links as one car's."""
 
 import tempfile
 import threading
@@ -7,8 +7,10 @@ from pathlib import Path
 import can
 import pytest
 
+from dbc.catalogue import load
 from dbc.frame import CanFrame
-from dbc.link import MAX_FRAMES_PER_RECEIVE, CanLink, LinkError
+from dbc.link import MAX_FRAMES_PER_RECEIVE, BusSet, CanLink, LinkError, bus_names
+from tests.support.processes import wait_until
 from vehicle_emulator.bus.hub import Hub
 from xil.bus import socketcan_problem
 
@@ -99,6 +101,7 @@ def test_only_classical_data_frames_with_11_bits_pass(bus_name):
     ]
     if not bus_name.startswith("socketcan"):  # whose kernel keeps CAN FD from a classical socket, and makes error frames itself
         strange.append(can.Message(arbitration_id=0x110, is_extended_id=False, is_fd=True, data=bytes(12)))
+    if bus_name.startswith("virtual"):  # the emulated bus lets nobody but the bus itself make error frames either
         strange.append(can.Message(arbitration_id=0x040, is_extended_id=False, is_error_frame=True, data=bytes(8)))
     settings = {"fd": True} if bus_name.startswith("xilgate") else {}
     with CanLink(bus_name) as link, python_can_bus(bus_name, **settings) as other:
@@ -226,3 +229,94 @@ def test_the_users_python_can_configuration_changes_nothing(monkeypatch, tmp_pat
     with CanLink("virtual:configured") as link:
         link.send([CanFrame(1, b"", 0)])
         assert link.receive() == []
+
+
+CATALOGUE = load()
+SR_COMMAND, SR_STATUS, POS_LOCAL = (CATALOGUE.by_name[name].arbitration_id for name in ("SR_Command", "SR_Status", "PosLocal"))
+UNKNOWN = 1
+TWO_BUSES = bus_names("virtual:set robots", "virtual:set navigation")
+
+
+def ids(frames: list[CanFrame]) -> list[int]:
+    return [frame.arbitration_id for frame in frames]
+
+
+def test_the_navigation_system_is_on_the_robots_bus_unless_told():
+    assert bus_names("socketcan:can0") == {"robots": "socketcan:can0", "navigation": "socketcan:can0"}
+    assert bus_names("socketcan:can0", "socketcan:can1") == {"robots": "socketcan:can0", "navigation": "socketcan:can1"}
+
+
+def test_each_frame_travels_on_the_bus_of_its_message():
+    frames = [CanFrame(arbitration_id, b"", 0) for arbitration_id in (SR_COMMAND, POS_LOCAL, UNKNOWN, SR_STATUS)]
+    with (
+        BusSet(TWO_BUSES, CATALOGUE) as car,
+        BusSet(TWO_BUSES, CATALOGUE) as gateway,
+        CanLink(TWO_BUSES["robots"]) as robots,
+        CanLink(TWO_BUSES["navigation"]) as navigation,
+    ):
+        car.send(frames)
+        assert ids(robots.receive()) == [SR_COMMAND, UNKNOWN, SR_STATUS]
+        assert ids(navigation.receive()) == [POS_LOCAL]
+        assert ids(gateway.receive()) == [SR_COMMAND, UNKNOWN, SR_STATUS, POS_LOCAL]
+        assert car.receive() == []
+        assert (gateway.dead, gateway.dropped) == ([], {})
+
+
+def test_a_message_on_the_wrong_bus_is_counted_and_not_heard():
+    with (
+        BusSet(TWO_BUSES, CATALOGUE) as gateway,
+        CanLink(TWO_BUSES["robots"]) as robots,
+        python_can_bus(TWO_BUSES["navigation"]) as navigation,
+    ):
+        robots.send([CanFrame(POS_LOCAL, bytes(8), 0), CanFrame(SR_STATUS, bytes(8), 0)])
+        for arbitration_id in (SR_STATUS, SR_COMMAND, UNKNOWN, POS_LOCAL):
+            navigation.send(can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=bytes(8)))
+        navigation.send(can.Message(arbitration_id=POS_LOCAL, is_extended_id=True))
+        assert ids(gateway.receive()) == [SR_STATUS, UNKNOWN, POS_LOCAL]
+        assert gateway.misplaced_frames == 3
+        assert gateway.dropped == {"wrong bus": 3, "no classical data frame": 1}
+
+
+def test_on_one_bus_no_message_is_out_of_place():
+    both = bus_names("virtual:set one")
+    with BusSet(both, CATALOGUE) as gateway, BusSet(both, CATALOGUE) as car:
+        car.send([CanFrame(POS_LOCAL, b"", 0), CanFrame(SR_STATUS, b"", 0)])
+        assert ids(gateway.receive()) == [POS_LOCAL, SR_STATUS]
+        gateway.send([CanFrame(SR_COMMAND, b"", 0)])
+        assert ids(car.receive()) == [SR_COMMAND]
+        assert gateway.receive() == []
+        assert gateway.dropped == {}
+
+
+def test_a_bus_that_dies_takes_no_other_with_it(served):
+    buses = bus_names("virtual:set alive", "xilgate:bus0")
+    with BusSet(buses, CATALOGUE) as gateway, CanLink("virtual:set alive") as robots:
+        served.stop()
+        robots.send([CanFrame(SR_STATUS, b"", 0)])
+        assert ids(gateway.receive()) == [SR_STATUS]
+        assert gateway.dead == ["navigation"]
+        gateway.send([CanFrame(SR_COMMAND, b"", 0), CanFrame(POS_LOCAL, b"", 0)])
+        assert ids(robots.receive()) == [SR_COMMAND]
+
+
+@pytest.mark.parametrize("missing", ["robots", "navigation"])
+def test_a_bus_that_does_not_open_is_named_and_leaves_none_open(served, missing):
+    buses = bus_names("xilgate:bus0", "xilgate:bus0") | {missing: "xilgate:nobody"}
+    with pytest.raises(LinkError, match=rf"^{missing}: bus 'xilgate:nobody' does not open: no hub"):
+        BusSet(buses, CATALOGUE)
+    with CanLink("xilgate:bus0"):
+        wait_until(lambda: len(served.hub.core.nodes) == 1, PATIENCE_S, "only this link on the bus")
+
+
+@pytest.mark.parametrize(("buses", "is_possible"), [(bus_names("xilgate:bus0"), True), (TWO_BUSES, False)])
+@pytest.mark.parametrize("disturbed", [None, SR_STATUS])
+def test_an_emulated_bus_can_be_disturbed_and_no_other(served, buses, is_possible, disturbed):
+    with BusSet(buses, CATALOGUE) as car, BusSet(buses, CATALOGUE) as gateway:
+        assert car.disturb(disturbed, 1) is is_possible
+        car.send([CanFrame(SR_STATUS, bytes(8), 0)])
+        received: list[CanFrame] = []
+        wait_until(lambda: received.extend(gateway.receive()) or received, PATIENCE_S, "the frame, repeated")
+        assert ids(received) == [SR_STATUS]
+        assert (car.dead, gateway.dead) == ([], [])
+        if is_possible:
+            assert sum(node.errors for node in served.hub.core.nodes.values()) == 2  # one for its sender, one for its receiver

@@ -9,7 +9,7 @@ TEXT = FOCUS.read_text()
 
 def test_the_two_sides_of_the_mismatch_share_the_wheelbase():
     vehicle = load_vehicle()
-    model, plant = vehicle.model, vehicle.plant
+    model, plant = vehicle.model, vehicle.multibody.masses
     assert model.cog_to_front_m + model.cog_to_rear_m == pytest.approx(plant.cog_to_front_m + plant.cog_to_rear_m)
     assert plant.mass_kg != model.mass_kg
 

@@ -24,6 +24,17 @@ def test_state_is_si_and_iso_8855():
     assert state.t_ns == drive.now_ns
 
 
+def test_the_state_is_as_old_as_the_time_of_its_navigation_data():
+    drive = GatewayDrive().tick(5)
+    arrived_ns = drive.now_ns + 3_000_000
+    sr_status = drive.catalogue.by_name["SR_Status"].arbitration_id
+    *others, robot = sorted(drive.car.speak(drive.now_ns), key=lambda frame: frame.arbitration_id == sr_status)
+    # On a bus of its own a robot's frame comes when it comes, which says nothing about the navigation data.
+    frames = [frame._replace(t_ns=arrived_ns) for frame in others] + [robot._replace(t_ns=arrived_ns + 4_000_000)]
+    output = drive.core.step(drive.now_ns + TICK_NS, frames)
+    assert output.state.t_ns == arrived_ns
+
+
 def test_silent_until_engaged():
     drive = GatewayDrive()
     drive.steer_rad, drive.drive_norm = 0.1, 0.5

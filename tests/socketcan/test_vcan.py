@@ -8,7 +8,7 @@ import pytest
 
 from dbc.catalogue import load
 from dbc.frame import CanFrame
-from dbc.link import CanLink
+from dbc.link import BusSet, CanLink, bus_names
 from tests.support.processes import free_base_port, wait_until, xilgate
 from xil.bus import choose, socketcan_problem
 
@@ -24,8 +24,27 @@ def can_utils():
         pytest.fail("candump is missing; on Debian: apt-get install can-utils")
 
 
-def test_auto_takes_it():
-    assert choose("auto").name == "socketcan:vcan0"
+def test_auto_takes_what_is_up():
+    navigation = "socketcan:vcan0" if socketcan_problem("vcan1") else "socketcan:vcan1"
+    assert choose("auto").names == bus_names("socketcan:vcan0", navigation)
+
+
+@pytest.mark.parametrize("navigation", ["vcan0", "vcan1"])
+def test_robots_and_navigation_system_on_one_interface_or_two(navigation):
+    if problem := socketcan_problem(navigation):
+        pytest.skip("; ".join(problem))
+    buses = bus_names("socketcan:vcan0", f"socketcan:{navigation}")
+    status, position = (CanFrame(CATALOGUE.by_name[name].arbitration_id, bytes(8), 0) for name in ("SR_Status", "PosLocal"))
+    with BusSet(buses, CATALOGUE) as car, BusSet(buses, CATALOGUE) as gateway, CanLink(buses["robots"]) as other:
+        car.send([status, position])
+        received = []
+        wait_until(lambda: received.extend(gateway.receive()) or len(received) == 2, 10, "both frames")
+        assert {frame.arbitration_id for frame in received} == {status.arbitration_id, position.arbitration_id}
+        assert len(other.receive()) == (2 if navigation == "vcan0" else 1)
+        other.send([position])
+        wait_until(lambda: received.extend(gateway.receive()) or gateway.misplaced_frames + len(received) == 3, 10, "the frame")
+        assert gateway.misplaced_frames == (0 if navigation == "vcan0" else 1)
+        assert car.dead == gateway.dead == []
 
 
 def test_candump_sees_what_we_send():
@@ -57,10 +76,10 @@ def test_three_processes_drive_over_it(tmp_path):
     print(finished.stderr)
     assert finished.returncode in (0, 1)
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert json.loads((tmp_path / "configuration.json").read_text())["bus"] == "socketcan:vcan0"
+    assert json.loads((tmp_path / "configuration.json").read_text())["bus"] == choose("auto").names
     engaged_s = next(m["value"] for m in summary["metrics"] if m["name"] == "time engaged")
     assert engaged_s > 0.0, summary["reason"]
     frames = [line.split()[2].partition("#") for line in (tmp_path / "bus.log").read_text().splitlines()]
-    assert {int(identifier, 16) for identifier, _, _ in frames} == CATALOGUE.by_id.keys()
+    assert {int(identifier, 16) for identifier, _, _ in frames} == {i for i, spec in CATALOGUE.by_id.items() if spec.cycle_time_ns > 0}
     commands = [CanFrame(SR_COMMAND, bytes.fromhex(data), 0) for identifier, _, data in frames if int(identifier, 16) == SR_COMMAND]
     assert any(CATALOGUE.decode(CATALOGUE.by_id[SR_COMMAND], command)["Enable"] for command in commands)

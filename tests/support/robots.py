@@ -51,7 +51,7 @@ class StubCar:
             "VelocityLevel": {"VelForward": self.vx_mps, "VelLateral": 0.5},
             "VelYawLocal": {"AngleLocalYaw": 10.0},
             "RateVehicle": {"AngRateZ": -5.0},
-            "AccelVehicle": {},
+            "AccelLevel": {},
             "NcomStatus00": {"PosMode": self.catalogue.enumeration("NcomStatus00", "PosMode")[self.position_mode]},
             "RC_SafetyStatus": {
                 "SystemState": states[self.system_state or self._state],

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# vcan_guest.sh COMMAND [ARG...]: run a command where there is a real SocketCAN interface vcan0.
+# vcan_guest.sh COMMAND [ARG...]: run a command where there are real SocketCAN interfaces vcan0 and vcan1.
 #
 # Many kernels, those of CI machines above all, have no CAN. User-mode Linux is a Linux kernel that runs as an ordinary program:
 # Debian's package user-mode-linux brings one with the CAN modules. The guest's file system is the host's (hostfs, read-write, same
@@ -24,7 +24,8 @@ ln -s /proc/self/fd /dev/fd 2>/dev/null
 for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/net/can/vcan; do
   insmod "$guest_modules/$module.ko"
 done
-ip link set lo up; ip link add vcan0 type vcan && ip link set vcan0 up
+ip link set lo up
+for interface in vcan0 vcan1; do ip link add $interface type vcan && ip link set $interface up; done
 stty -F /dev/tty0 raw -echo
 mkfifo /run/output; cat /run/output > /dev/tty0 & reader=$!      # not a terminal, for what the command prints
 setsid bash "$guest_work/command" < /dev/null > /run/output 2>&1

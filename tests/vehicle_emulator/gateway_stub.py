@@ -12,6 +12,7 @@ class GatewayStub:
         self.catalogue = catalogue
         self.requests = catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
         self._protectors: dict[str, E2EProtector] = {}
+        self._challenge = 0
 
     def frame(self, name: str, values: dict[str, float], t_ns: int = 0) -> CanFrame:
         spec = self.catalogue.by_name[name]
@@ -20,17 +21,24 @@ class GatewayStub:
         return CanFrame(spec.arbitration_id, protector.protect(self.catalogue.encode(name, values)), t_ns)
 
     def safety(self, request: str, **values: float) -> CanFrame:
-        return self.frame("GW_SafetyCommand", {"SystemRequest": self.requests[request], **values})
+        self._challenge = (self._challenge + 1) % 256
+        defaults = {"SystemRequest": self.requests[request], "WatchdogChallenge": self._challenge, "MaxSpeed": 255}
+        return self.frame("GW_SafetyCommand", {**defaults, **values})
 
-    def steering(self, angle_deg: float, enable: bool = True, mode: str = "AnglePosition", rate_dps: float = 2550.0) -> CanFrame:
+    def steering(
+        self, angle_deg: float, enable: bool = True, mode: str = "AnglePosition", rate_dps: float = 2550.0, **values: float
+    ) -> CanFrame:
         modes = self.catalogue.enumeration("SR_Command", "Mode")
-        values = {"Mode": modes[mode], "Enable": enable, "AngleCommand": angle_deg, "RateLimit": rate_dps}
-        return self.frame("SR_Command", values)
+        defaults = {"Mode": modes[mode], "Enable": enable, "AngleCommand": angle_deg, "RateLimit": rate_dps, "TorqueLimit": 60.0}
+        return self.frame("SR_Command", {**defaults, **values})
 
-    def pedal(self, node: str, percent: float, enable: bool = True, rate_mmps: float = 2550.0) -> CanFrame:
+    def pedal(
+        self, node: str, percent: float, enable: bool = True, rate_mmps: float = 2550.0, mode: str = "Position", **values: float
+    ) -> CanFrame:
         name = f"{node}_Command"
-        mode = self.catalogue.enumeration(name, "Mode")["Position"]
-        return self.frame(name, {"Mode": mode, "Enable": enable, "PositionCommand": percent, "RateLimit": rate_mmps})
+        modes = self.catalogue.enumeration(name, "Mode")
+        defaults = {"Mode": modes[mode], "Enable": enable, "PositionCommand": percent, "RateLimit": rate_mmps, "ForceLimit": 510.0}
+        return self.frame(name, {**defaults, **values})
 
     def frames(self, request: str, sr_deg: float = 0.0, ar_percent: float = 0.0, br_percent: float = 0.0) -> list[CanFrame]:
         return [self.safety(request), self.steering(sr_deg), self.pedal("AR", ar_percent), self.pedal("BR", br_percent)]

@@ -14,6 +14,7 @@ from gateway.telemetry import (
     DEFAULT_BASE_PORT,
     TOPICS,
     CommandSample,
+    FaultSample,
     Lane,
     ObjectsSample,
     ParameterChange,
@@ -99,6 +100,7 @@ def samples_at(t_s: float, t_ns: int, seq: int) -> list[Sample]:
             **stamp, version=2, accepted_ns=t_ns, who="ann@desk", reverts=[],
             changes=[ParameterChange(name="planner.safe_time_s", old=1.2, new=1.8)],
         ),
+        FaultSample(**stamp, name="gust", what="gust push_n=2500", event="begins", hits=0),
         ObjectsSample(**stamp, objects=[WorldObject(name="van", x_m=150.0, y_m=5.4, yaw_rad=0.0, length_m=4.8, width_m=1.9)]),
         PlanSample(
             **stamp, x_m=ahead_m, y_m=[c[0] + error_m * math.exp(-0.2 * k) for k, c in enumerate(courses)],
@@ -119,7 +121,9 @@ def samples_at(t_s: float, t_ns: int, seq: int) -> list[Sample]:
     ]
 
 
-_EVERY_TICKS = {"state": 2, "status": 10, "command": 4, "plan": 4, "profile": 20, "parameters": 50, "world": 1, "scene": 50, "objects": 4}
+_EVERY_TICKS = {
+    "state": 2, "status": 10, "command": 4, "plan": 4, "profile": 20, "parameters": 50, "world": 1, "faults": 50, "scene": 50, "objects": 4,
+}  # fmt: skip
 
 
 class Feeder:

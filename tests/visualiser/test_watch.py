@@ -14,7 +14,7 @@ from visualiser.board import Board
 from visualiser.watch import WatchOptions, line, run, table
 
 MS = 1_000_000
-TOPICS = ("state", "status", "command", "plan", "profile", "parameters", "world", "scene", "objects")
+TOPICS = ("state", "status", "command", "plan", "profile", "parameters", "world", "faults", "scene", "objects")
 
 
 def full_board(**status: object) -> Board:

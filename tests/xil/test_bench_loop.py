@@ -64,7 +64,8 @@ def test_knowing_the_delay_calms_the_pedals_and_keeps_the_car_on_its_path():
     assert {vehicle.robots.steering.dead_time_s, vehicle.robots.accelerator.dead_time_s, vehicle.robots.brake.dead_time_s} == {0.08}
     blind, aware = (full_drive(FullDrive(SOLVER, variant, scenario, vehicle, 1)) for variant in (BLIND_OBSERVED, AWARE_OBSERVED))
     assert aware.pedals_norm < 0.7 * blind.pedals_norm
-    assert aware.lateral_error_max_m < 0.1 < blind.lateral_error_max_m
+    assert aware.lateral_error_max_m < 0.2
+    assert blind.lateral_error_max_m > 1.0
 
 
 def test_the_delay_rows_compare_like_with_like():
@@ -79,7 +80,7 @@ def test_the_delay_rows_compare_like_with_like():
 
 def test_slope_and_mass_leave_no_speed_error():
     vehicle, scenario = with_mass(VEHICLE, 1.1), on_grade(load_scenario("iso3888-1"), 6.0)
-    assert vehicle.plant.mass_kg == pytest.approx(1.1 * VEHICLE.plant.mass_kg)
+    assert vehicle.multibody.masses.mass_kg == pytest.approx(1.1 * VEHICLE.multibody.masses.mass_kg)
     assert vehicle.model == VEHICLE.model
     without, with_it = (full_drive(FullDrive(SOLVER, variant, scenario, vehicle, 1)) for variant in (UNOBSERVED, DRIVEN))
     assert with_it.speed_error_rms_mps <= 0.1

@@ -1,4 +1,4 @@
-"""The user's `--bus`: what it becomes, and the one line when it cannot be."""
+"""The user's `--bus` and `--navigation-bus`: what they become, and the one line when they cannot be."""
 
 import os
 import tempfile
@@ -6,11 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from vehicle_emulator.bus.hub import Hub
+from dbc.link import bus_names
+from vehicle_emulator.bus.hub import Hub, HubOptions
 from xil.bus import BusChoice, BusChoiceError, choose, socketcan_problem
 
 CAN, ETHERNET, UP, DOWN = "280", "1", "0x40043", "0x40080"
-EMULATED = BusChoice("xilgate:bus0", "bus0")
+EMULATED = BusChoice(bus_names("xilgate:robots", "xilgate:navigation"), {"robots": "robots", "navigation": "navigation"})
+
+
+def existing(robots: str, navigation: str | None = None) -> BusChoice:
+    return BusChoice(bus_names(robots, navigation), {})
 
 
 @pytest.fixture(autouse=True)
@@ -34,12 +39,17 @@ def runtime_directory(monkeypatch):
 
 
 def refusal(bus: str) -> str:
-    with pytest.raises(BusChoiceError) as raised:
-        choose(bus)
-    text = str(raised.value)
-    assert text.startswith(f"bus {bus!r}: ")
-    assert "\n" not in text
-    return text.removeprefix(f"bus {bus!r}: ")
+    """The line that refuses a bus, the same for either option."""
+    texts = []
+    for option, words in (("--bus", (bus,)), ("--navigation-bus", ("emulated", bus))):
+        with pytest.raises(BusChoiceError) as raised:
+            choose(*words)
+        text = str(raised.value)
+        assert text.startswith(f"{option} {bus!r}: ")
+        assert "\n" not in text
+        texts.append(text.removeprefix(f"{option} {bus!r}: "))
+    assert texts[0] == texts[1]
+    return texts[0]
 
 
 def test_auto_is_emulated_without_vcan0():
@@ -56,7 +66,29 @@ def test_auto_takes_vcan0_when_it_is_up_and_nothing_else(interfaces):
     interfaces("can0", CAN, UP)
     assert choose("auto") == EMULATED
     interfaces("vcan0", CAN, UP)
-    assert choose("auto") == BusChoice("socketcan:vcan0", None)
+    assert choose("auto") == existing("socketcan:vcan0")
+
+
+def test_auto_takes_vcan1_for_the_navigation_system_when_both_are_up(interfaces):
+    interfaces("vcan1", CAN, UP)
+    assert choose("auto") == EMULATED
+    interfaces("vcan0", CAN, UP)
+    assert choose("auto") == existing("socketcan:vcan0", "socketcan:vcan1")
+    assert choose("socketcan:vcan0") == existing("socketcan:vcan0")
+
+
+def test_each_network_can_be_told_its_bus(interfaces):
+    interfaces("can0", CAN, UP)
+    interfaces("can1", CAN, UP)
+    assert choose("socketcan:can0", "socketcan:can1") == existing("socketcan:can0", "socketcan:can1")
+    assert choose("emulated", "emulated") == EMULATED
+    assert choose("auto", "auto") == EMULATED
+    assert choose("emulated", "socketcan:can1") == BusChoice(bus_names("xilgate:robots", "socketcan:can1"), {"robots": "robots"})
+    for navigation in ("emulated", "auto"):
+        own = BusChoice(bus_names("socketcan:can0", "xilgate:navigation"), {"navigation": "navigation"})
+        assert choose("socketcan:can0", navigation) == own
+    interfaces("vcan1", CAN, UP)
+    assert choose("socketcan:can0", "auto") == existing("socketcan:can0", "socketcan:vcan1")
 
 
 def test_emulated_is_emulated_even_with_vcan0(interfaces):
@@ -64,15 +96,15 @@ def test_emulated_is_emulated_even_with_vcan0(interfaces):
     assert choose("emulated") == EMULATED
 
 
-def test_a_second_run_gets_a_bus_of_its_own():
-    with Hub("bus0"):
-        channel = f"run-{os.getpid()}"
-        assert choose("emulated") == BusChoice(f"xilgate:{channel}", channel)
+def test_a_second_run_gets_buses_of_its_own():
+    with Hub("robots"), Hub("navigation"):
+        channels = {network: f"run-{os.getpid()}-{network}" for network in ("robots", "navigation")}
+        assert choose("emulated") == BusChoice(bus_names(*(f"xilgate:{channel}" for channel in channels.values())), channels)
 
 
 def test_a_socketcan_interface_that_is_up(interfaces):
     interfaces("can1", CAN, UP)
-    assert choose("socketcan:can1") == BusChoice("socketcan:can1", None)
+    assert choose("socketcan:can1") == existing("socketcan:can1")
 
 
 def test_a_missing_virtual_interface_is_to_be_made():
@@ -99,11 +131,20 @@ def test_an_interface_that_is_no_can_interface(interfaces):
 
 def test_a_running_hub_is_used_and_not_started():
     with Hub("bus0"):
-        assert choose("xilgate:bus0") == BusChoice("xilgate:bus0", None)
+        assert choose("xilgate:bus0") == existing("xilgate:bus0")
 
 
 def test_a_hub_that_is_not_there():
-    assert refusal("xilgate:bus0").startswith("no hub serves this channel (/tmp/")
+    text = refusal("xilgate:bus0")
+    assert text.startswith("no hub serves this channel (/tmp/")
+    assert text.endswith("`xilgate bus bus0` starts one")
+
+
+def test_a_hub_on_a_port():
+    with Hub("bus0", HubOptions(tcp_port=0)) as hub:
+        assert choose(f"xilgate:tcp://127.0.0.1:{hub.tcp_port}") == existing(f"xilgate:tcp://127.0.0.1:{hub.tcp_port}")
+        port = hub.tcp_port
+    assert refusal(f"xilgate:tcp://127.0.0.1:{port}") == f"no hub serves this port; `xilgate bus --tcp {port}` starts one"
 
 
 def test_a_bad_channel_name():

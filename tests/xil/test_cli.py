@@ -32,12 +32,26 @@ def test_unknown_bus(tmp_path, bus):
     fails(2, bus, arguments=["drive", "--bus", bus, "--out", str(tmp_path)])
 
 
+@pytest.mark.parametrize("bus", ["canbus", "socketcan:nope7", "xilgate:nobody"])
+def test_unknown_navigation_bus(tmp_path, bus):
+    fails(2, "--navigation-bus", bus, arguments=["drive", "--bus", "emulated", "--navigation-bus", bus, "--out", str(tmp_path)])
+
+
+@pytest.mark.parametrize("process", ["gateway", "emulator"])
+def test_a_daemon_names_the_bus_that_does_not_open(process):
+    port = ["--telemetry-port", str(free_base_port())]
+    fails(3, "robots: bus 'virtual'", arguments=[process, "--bus", "virtual", *port])
+    fails(3, "navigation: bus 'xilgate:nobody'", arguments=[process, "--bus", "virtual:0", "--navigation-bus", "xilgate:nobody", *port])
+
+
 def test_unknown_solver(tmp_path):
     fails(2, "magic", "casadi-c", arguments=["drive", "--solver", "magic", "--out", str(tmp_path)])
 
 
 def test_vehil_needs_a_real_bus(tmp_path):
     fails(2, "--bus", arguments=["drive", "--stage", "vehil", "--out", str(tmp_path)])
+    one_named = ["--bus", "socketcan:can0", "--navigation-bus", "emulated"]
+    fails(2, "--navigation-bus", arguments=["drive", "--stage", "vehil", *one_named, "--out", str(tmp_path)])
 
 
 @pytest.mark.parametrize("offset", [0, 1, 2, 3])
@@ -51,7 +65,7 @@ def test_busy_telemetry_port(tmp_path, offset):
         fails(3, str(base + offset), "busy", "--telemetry-port", arguments=arguments)
 
 
-@pytest.mark.parametrize("option", [["--bus", "emulated"], ["--view"]])
+@pytest.mark.parametrize("option", [["--bus", "emulated"], ["--navigation-bus", "emulated"], ["--view"]])
 def test_lockstep_takes_no_bus_and_no_view(tmp_path, option):
     fails(2, "sil", option[0], arguments=["drive", "--stage", "sil", *option, "--out", str(tmp_path)])
 

@@ -2,12 +2,18 @@
 
 import json
 import re
-from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from dbc.catalogue import load
 from tests.support.processes import xilgate
+from vehicle_emulator.bus.bits import frame_bits
+from vehicle_emulator.bus.frame import BusFrame
+from xil.buslog import recorded_load
+
+MAX_RESPONSE_US = 10_000
+"""Longest time that a message of the default set can take on its bus, rounded up to the shortest cycle."""
 
 
 def drive(out, *arguments):
@@ -33,7 +39,7 @@ def test_sil_drives_the_double_lane_change(sil):
     for gate in (1, 2, 3):
         assert metric(summary, f"clearance in gate {gate}")["value"] > 0.0
     assert metric(summary, "disengagements before the end")["value"] == 0
-    expected = {"summary.json", "report.html", "bus.log", "scenario.toml", "reference.csv", "configuration.json"}
+    expected = {"summary.json", "report.html", "bus.log", "scenario.toml", "reference.csv", "road.toml", "configuration.json"}
     assert expected == {path.name for path in out.iterdir()}
 
 
@@ -48,19 +54,53 @@ def test_other_seed_passes_as_well(sil):
     assert sil[2][0].returncode == 0, sil[2][1]["reason"]
 
 
-def test_bus_log_holds_every_cyclic_message_at_its_period(sil):
+def record(out):
+    """Lines of the bus record: time [us], channel, message, payload."""
     catalogue = load()
-    line = re.compile(r"\((\d+)\.(\d{6})\) lockstep ([0-9A-F]{3})#((?:[0-9A-F]{2})*)")
+    line = re.compile(r"\((\d+)\.(\d{6})\) (robots|navigation) ([0-9A-F]{3})#((?:[0-9A-F]{2})*)")
+    for text in (out / "bus.log").read_text().splitlines():
+        seconds, micros, channel, identifier, data = line.fullmatch(text).groups()
+        yield int(seconds) * 1_000_000 + int(micros), channel, catalogue.by_id[int(identifier, 16)], bytes.fromhex(data)
+
+
+def test_bus_log_holds_every_cyclic_message_at_its_period(sil):
+    lines = list(record(sil[0][2]))
+    assert [t_us for t_us, *_ in lines] == sorted(t_us for t_us, *_ in lines)
     times_us = {}
-    for text in (sil[0][2] / "bus.log").read_text().splitlines():
-        seconds, micros, identifier, data = line.fullmatch(text).groups()
-        spec = catalogue.by_id[int(identifier, 16)]
-        assert len(data) == 2 * spec.length_bytes
-        times_us.setdefault(spec.name, []).append(int(seconds) * 1_000_000 + int(micros))
-    assert times_us.keys() == catalogue.by_name.keys()
+    for t_us, channel, spec, data in lines:
+        assert channel == spec.network
+        assert len(data) == spec.length_bytes
+        times_us.setdefault(spec.name, []).append(t_us)
+    by_name = load().by_name
+    assert times_us.keys() == {name for name, spec in by_name.items() if spec.cycle_time_ns}
     for name, times in times_us.items():
-        steps = {b - a for a, b in pairwise(times)}
-        assert steps == {catalogue.by_name[name].cycle_time_ns // 1000}, name
+        cycle_us = by_name[name].cycle_time_ns / 1000
+        # Arbitration moves a frame within its cycle, never from one to the next.
+        assert np.diff(times).mean() == pytest.approx(cycle_us, rel=0.01), name
+        assert np.abs(np.diff(times) - cycle_us).max() < MAX_RESPONSE_US, name
+
+
+def test_no_bit_of_a_bus_is_used_twice(sil):
+    ends_us = {}
+    for t_us, channel, spec, data in record(sil[0][2]):
+        bits, _ = frame_bits(BusFrame(spec.arbitration_id, data, 0, len(data)))
+        assert t_us - 2 * bits >= ends_us.get(channel, 0) + 2 * 3 - 1  # bits of 2 us, an intermission, time stamps cut to 1 us
+        ends_us[channel] = t_us
+    assert ends_us.keys() == {"robots", "navigation"}
+
+
+def test_the_load_of_the_buses_is_that_of_the_record(sil):
+    _, summary, out = sil[0]
+    counted = recorded_load(out / "bus.log", load().bitrate_bps)
+    assert summary["bus_load"] == {network: pytest.approx(load, rel=1e-3) for network, load in counted.items()}
+    assert 0.1 < counted["robots"] < counted["navigation"] < 0.9
+
+
+def test_the_run_tells_how_fast_it_was(sil):
+    finished, summary, _ = sil[0]
+    line = re.search(r"^([\d.]+) s of driving in ([\d.]+) s, ([\d.]+) times real time$", finished.stderr, re.MULTILINE)
+    assert summary["realtime_factor"] == pytest.approx(float(line[3]), abs=0.051)
+    assert summary["realtime_factor"] == pytest.approx(float(line[1]) / float(line[2]), rel=0.05)
 
 
 def test_mil_passes_with_the_uncompiled_controller(tmp_path):

@@ -4,7 +4,7 @@ from msgspec.structs import replace
 
 from gateway.messages import Operation
 from gateway.telemetry import StateSample
-from xil.operator import READY_TIMEOUT_S, Advice, Ending, Operator
+from xil.operator import PATIENCE_S, READY_TIMEOUT_S, Advice, Ending, Operator
 
 STATE = StateSample(
     t_ns=0, seq=0, mode="STANDBY", is_valid=True, x_m=0.0, y_m=0.0, yaw_rad=0.0, vx_mps=0.0, vy_mps=0.0, yaw_rate_radps=0.0, ax_mps2=0.0,
@@ -15,8 +15,8 @@ STATE = StateSample(
 class Run:
     """Feeds an operator every 20 ms; the car drives at `vx_mps` along x."""
 
-    def __init__(self, time_limit_s=60.0):
-        self.operator = Operator(time_limit_s)
+    def __init__(self, time_limit_s=60.0, end_m=50.0):
+        self.operator = Operator(time_limit_s, lambda x_m, y_m: x_m > end_m)
         self.t_s = self.x_m = 0.0
 
     def go(self, duration_s, mode, vx_mps=0.0, is_valid=True):
@@ -48,6 +48,16 @@ def test_ends_when_the_car_stands_at_the_end():
     assert run.go(5.0, "ENGAGED", 20.0) == Advice()
     assert run.go(0.4, "ENGAGED", 0.0) == Advice()
     assert run.go(0.4, "ENGAGED", 0.0) == Advice(Operation.DISENGAGE, Ending.COMPLETED)
+
+
+def test_before_the_end_the_car_may_stand_for_a_while_and_drive_on():
+    run = Run()
+    run.go(0.1, "READY", 5.0)
+    assert run.go(2.0, "ENGAGED", 5.0) == Advice()
+    assert run.go(PATIENCE_S - 0.5, "ENGAGED", 0.0) == Advice()
+    assert run.go(1.0, "ENGAGED", 5.0) == Advice()
+    assert run.go(PATIENCE_S - 0.5, "ENGAGED", 0.0) == Advice()
+    assert run.go(1.0, "ENGAGED", 0.0) == Advice(Operation.DISENGAGE, Ending.COMPLETED)
 
 
 def test_a_start_from_standstill_is_no_end():

@@ -17,20 +17,23 @@ EVERYONE = {"bus", "gateway", "controller", "emulator"}
 
 
 class Drive:
-    """A running `xilgate drive` and its newest state."""
+    """A running `xilgate drive` and its newest state and status."""
 
-    def __init__(self, out, scenario="iso3888-1"):
+    def __init__(self, out, scenario="iso3888-1", buses=("--bus", "emulated")):
         self.port = port = free_base_port()
         self.out = out
         self.state = None
-        self._subscriber = Subscriber(self._receive, ["state"], port)
-        arguments = ["--stage", "hil", "--bus", "emulated", "--out", str(out), "--telemetry-port", str(port)]
+        self.status = None
+        self._subscriber = Subscriber(self._receive, ["state", "status"], port)
+        arguments = ["--stage", "hil", *buses, "--out", str(out), "--telemetry-port", str(port)]
         self.process = start_xilgate("drive", scenario, *arguments)
         self.children = {}
 
     def _receive(self, topic, payload):
         if isinstance(sample := decode(topic, payload), StateSample):
             self.state = sample
+        else:
+            self.status = sample
 
     def wait_for(self, condition, what):
         def is_there():
@@ -113,6 +116,31 @@ def test_whoever_is_killed_ends_the_run_and_is_named(drive, victim):
     assert drive.process.returncode == 1, output
     assert f"{victim} died (killed by SIGKILL)" in drive.summary()["reason"]
     assert drive.is_gone()
+
+
+@pytest.mark.parametrize("victim", ["robots", "navigation"])
+def test_a_bus_that_dies_alone_stops_the_car_and_is_named(tmp_path, victim):
+    channels = {network: f"alone-{os.getpid()}-{network}" for network in ("robots", "navigation")}
+    hubs = {network: start_xilgate("bus", channel) for network, channel in channels.items()}
+    wait_until(lambda: all(map(is_served, channels.values())), 20, "both buses")
+    buses = ["--bus", f"xilgate:{channels['robots']}", "--navigation-bus", f"xilgate:{channels['navigation']}"]
+    drive = Drive(tmp_path, buses=buses)
+    try:
+        drive.wait_for(in_manoeuvre, "the manoeuvre")
+        assert drive.children.keys() == EVERYONE - {"bus"}
+        assert drive.status.dead_buses == []
+        hubs[victim].kill()
+        wait_until(lambda: drive.state.mode == "SAFE_STOP", 5, "the safe stop")
+        wait_until(lambda: drive.status.dead_buses == [victim], 5, "the name of the bus")
+        assert drive.process.poll() is None
+        drive.process.send_signal(signal.SIGINT)
+        drive.process.communicate(timeout=20)
+        channels_seen = {line.split()[1] for line in (tmp_path / "bus.log").read_text().splitlines()}
+        assert channels_seen == set(channels.values())
+    finally:
+        drive.close()
+        for hub in hubs.values():
+            end(hub)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])

@@ -4,6 +4,7 @@ import hashlib
 import json
 import re
 import subprocess
+from dataclasses import asdict
 from datetime import UTC, datetime
 from html.parser import HTMLParser
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 from dbc.vehicle import FOCUS, load_vehicle
 from gateway.telemetry import ParameterChange, ParametersSample
 from tests.support.recorded_drive import RecordedDrive
+from xil.injected import InjectedFault
 from xil.metrics import evaluate
 from xil.report import write_report
 from xil.scenario import SCENARIO_FOLDER, Stage, load_scenario
@@ -49,13 +51,14 @@ class Page(HTMLParser):
             self.texts.setdefault(self.open[-1], []).append(data)
 
 
-def run(folder: Path, name: str = "iso3888-1", stage: Stage = Stage.HIL, changes=(), **spoiled):
+def run(folder: Path, name: str = "iso3888-1", stage: Stage = Stage.HIL, changes=(), faults=(), **spoiled):
     scenario = load_scenario(name)
     recording = RecordedDrive(scenario, VEHICLE, **spoiled).recording
     verdict = evaluate(recording, scenario, VEHICLE, stage)
     files = {"vehicle": FOCUS, "scenario": SCENARIO_FOLDER / f"{name}.toml"}
     started = datetime(2026, 5, 4, 12, 30, tzinfo=UTC)
-    summary = build_summary(RunFacts(scenario, stage, 7, "casadi-c", started, 21.5, "gcc 12.2", files), verdict, changes)
+    facts = RunFacts(scenario, stage, 7, "casadi-c", started, 21.5, "gcc 12.2", files, 6.254, {"robots": 0.19541})
+    summary = build_summary(facts, verdict, changes, faults)
     path = folder / "report.html"
     write_report(path, summary, recording, scenario, VEHICLE, verdict)
     return summary, path.read_text(encoding="utf-8")
@@ -75,6 +78,15 @@ def test_report_asks_nobody_for_anything(passed):
     assert Page(content).loading == []
     assert re.findall(r"https?://|\burl\(|@import|//[a-z0-9-]+\.[a-z]{2,}/", content) == []
     assert "default-src 'none'" in content
+
+
+def test_speed_and_bus_load_are_told(passed):
+    summary, content = passed
+    assert (summary["realtime_factor"], summary["bus_load"]) == (6.25, {"robots": 0.19541})
+    told = " ".join(Page(content).texts["dd"])
+    assert "6.2 times real time" in told
+    assert "19.54 %" in told
+    assert "load of bus robots" in Page(content).texts["dt"]
 
 
 def test_report_parses_and_stays_small(passed):
@@ -184,3 +196,24 @@ def test_git_revision_says_when_files_differ(tmp_path):
     assert re.fullmatch("[0-9a-f]{12}", clean)
     (tmp_path / "file").write_text("b")
     assert git_revision(tmp_path) == f"{clean}-dirty"
+
+
+def test_injected_faults_are_told(tmp_path):
+    garbled = InjectedFault("steering garbled", "bad_crc messages=SR_Status", 3.25, 5.25, 200)
+    summary, content = run(tmp_path, faults=[garbled, InjectedFault("gust", "gust push_n=1", 6.0, None, 0)])
+    assert summary["faults"][0] == asdict(garbled)
+    json.dumps(summary)
+    page = Page(content)
+    assert page.open == []
+    cells = page.texts["td"]
+    first = cells.index("steering garbled")
+    assert [cell.replace("\xa0", " ") for cell in cells[first : first + 10]] == [
+        "steering garbled", "3.25 s", "5.25 s", "200", "bad_crc messages=SR_Status", "gust", "6.00 s", "–", "0", "gust push_n=1",
+    ]  # fmt: skip
+    assert "faults injected: 2" in page.texts["b"]
+
+
+def test_without_faults_nothing_is_said_of_them(passed):
+    summary, content = passed
+    assert summary["faults"] == []
+    assert "njected" not in content

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dbc.vehicle import load_vehicle
+from vehicle_emulator.road import make_road
 from xil.course import passage
 from xil.scenario import SCENARIO_FOLDER, Scenario, ScenarioError, Stage, load_scenario, scenario_names
 
@@ -95,6 +96,49 @@ def test_mistake_is_told_with_file_key_and_what_is_allowed(tmp_path, old, new, e
 def test_every_mistake_has_a_line_of_its_own(tmp_path):
     text = ISO.replace("time_limit_s = 30.0", "time_limit_s = 0.0").replace("margin_m", "margin", 1)
     assert len(mistakes(tmp_path, text)) == 3
+
+
+ROAD = """[road]
+left_m = 7.0
+right_m = 3.5
+"""
+HILL = """[[road.heights]]
+station_m = 0.0
+height_m = 0.0
+[[road.heights]]
+station_m = 20.0
+height_m = {}
+"""
+ICE = """[[road.friction]]
+factor = {}
+from_m = 10.0
+to_m = 30.0
+right_m = -3.0
+left_m = -0.5
+"""
+
+
+def test_the_surface_of_the_road_lies_along_the_drive(tmp_path):
+    text = ISO.replace(ROAD, ROAD + "grade_percent = 5.0\ncross_fall_percent = 2.0\n" + HILL.format(1.0) + ICE.format(0.1))
+    scenario = load_scenario(written(tmp_path, text))
+    road = make_road(scenario.road_surface())
+    start, top, ice = road.at(-120.0, 0.0), road.at(20.0, 0.0), road.at(20.0, -2.0)
+    assert (start.z_m, start.slope_x, start.slope_y) == pytest.approx((0.0, 0.05, 0.02))
+    assert (top.z_m, top.friction) == pytest.approx((0.05 * 140.0 + 1.0, 1.0))
+    assert (ice.z_m, ice.friction) == pytest.approx((top.z_m - 0.04, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("more", "named"),
+    [
+        (HILL.format(9.0), "road.heights: allowed: slopes up to 0.5"),
+        (ICE.format(3.0), "road.friction.0.factor = 3.0: allowed: 0.02 to 2"),
+        ("cross_fall_percent = 30.0", "road.cross_fall_percent = 30.0: allowed: -20 to 20"),
+    ],
+)
+def test_a_mistake_about_the_surface_is_named(tmp_path, more, named):
+    (line,) = mistakes(tmp_path, ISO.replace(ROAD, ROAD + more))
+    assert named in line
 
 
 def test_road_too_narrow_for_the_car_is_told():

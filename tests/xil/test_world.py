@@ -10,7 +10,7 @@ from dbc.vehicle import load_vehicle
 from gateway.telemetry import ObjectsSample
 from tests.support.processes import xilgate
 from tests.support.recorded_drive import RecordedDrive
-from xil.course import Outline, separation_m
+from xil.course import Outline, Pose, separation_m
 from xil.map_view import draw_map
 from xil.metrics import closest, evaluate, trace
 from xil.scenario import SCENARIO_FOLDER, ScenarioError, Stage, load_scenario
@@ -19,6 +19,10 @@ from xil.world import World
 VEHICLE = load_vehicle()
 CUT_IN = (SCENARIO_FOLDER / "cut-in.toml").read_text(encoding="utf-8")
 SECOND_NS = 1_000_000_000
+
+
+def car_at(x_m, y_m=0.0, speed_mps=0.0):
+    return Pose(x_m, y_m, 0.0, speed_mps)
 
 
 def cut_in(tmp_path, *changes):
@@ -34,7 +38,7 @@ def cut_in(tmp_path, *changes):
     ("old", "new", "named"),
     [
         ("width_m = 1.8", "width_m = 0.0", "objects.0.width_m = 0.0: allowed: 0.1 to 50"),
-        ("width_m = 1.8", "", "objects.0.width_m: missing"),
+        ("width_m = 1.8", "", "objects.0: allowed: length_m and width_m, or a kind that has them: car, adult, child, cyclist"),
         ("width_m = 1.8", "width_m = nan", "objects.0.width_m = nan"),
         ("speed_kmh = 20.0", "speed_kmh = 20.0\ncolour = 1", "objects.0.colour: unknown key"),
         ("appears_at_m = 0.0", "appears_at_m = 0.0\nappears_at_s = 1.0", "allowed: one of appears_at_m and appears_at_s"),
@@ -57,11 +61,11 @@ def test_objects_of_one_name_are_refused(tmp_path):
 
 def test_an_object_appears_when_the_car_gets_to_its_station_and_stays_and_drives_on():
     world = World(load_scenario("cut-in"), VEHICLE, SECOND_NS)
-    assert world.sample(SECOND_NS, 0, -60.0, 0.0).objects == []
-    assert world.sample(2 * SECOND_NS, 1, -0.5, 0.0).objects == []
-    (seen,) = world.sample(3 * SECOND_NS, 2, 0.1, 0.3).objects
+    assert world.sample(SECOND_NS, 0, car_at(-60.0, 0.0)).objects == []
+    assert world.sample(2 * SECOND_NS, 1, car_at(-0.5, 0.0)).objects == []
+    (seen,) = world.sample(3 * SECOND_NS, 2, car_at(0.1, 0.3)).objects
     assert (seen.name, seen.x_m, seen.y_m, seen.yaw_rad) == ("slow car", pytest.approx(45.0), pytest.approx(0.0), pytest.approx(0.0))
-    (later,) = world.sample(5 * SECOND_NS, 3, -30.0, 0.3).objects
+    (later,) = world.sample(5 * SECOND_NS, 3, car_at(-30.0, 0.3)).objects
     assert later.x_m == pytest.approx(45.0 + 2.0 * 20.0 / 3.6)
     assert report_of(ObjectsSample(t_ns=0, seq=0, objects=[later])).rejected == 0
 
@@ -70,9 +74,9 @@ def test_an_object_may_appear_by_time_and_drive_across(tmp_path):
     across = ("appears_at_m = 0.0", "appears_at_s = 2.0\nheading_deg = 90.0")
     scenario = cut_in(tmp_path, across, ("offset_m = 0.0\nlength", "offset_m = -3.0\nlength"))
     world = World(scenario, VEHICLE, SECOND_NS)
-    assert world.sample(2 * SECOND_NS, 0, 0.0, 0.0).objects == []
-    assert len(world.sample(3 * SECOND_NS, 1, 0.0, 0.0).objects) == 1
-    (seen,) = world.sample(4 * SECOND_NS, 2, 0.0, 0.0).objects
+    assert world.sample(2 * SECOND_NS, 0, car_at(0.0, 0.0)).objects == []
+    assert len(world.sample(3 * SECOND_NS, 1, car_at(0.0, 0.0)).objects) == 1
+    (seen,) = world.sample(4 * SECOND_NS, 2, car_at(0.0, 0.0)).objects
     assert (seen.x_m, seen.y_m) == pytest.approx((45.0, -3.0 + 20.0 / 3.6))
     assert seen.yaw_rad == pytest.approx(np.pi / 2)
 
@@ -80,7 +84,7 @@ def test_an_object_may_appear_by_time_and_drive_across(tmp_path):
 def test_beside_a_curved_line_an_object_stands_along_it():
     scenario = load_scenario("lane-keeping")
     spec = load_scenario("parking").objects[0].model_copy(update={"station_m": 200.0, "offset_m": 1.2, "appears_at_m": None})
-    (seen,) = World(scenario.model_copy(update={"objects": [spec]}), VEHICLE, 0).sample(0, 0, 0.0, 0.0).objects
+    (seen,) = World(scenario.model_copy(update={"objects": [spec]}), VEHICLE, 0).sample(0, 0, car_at(0.0)).objects
     course = scenario.course(VEHICLE)
     along = course.project(np.array([seen.x_m]), np.array([seen.y_m]))
     assert (along.station_m[0], along.lateral_error_m[0]) == pytest.approx((200.0, 1.2), abs=0.02)
@@ -105,7 +109,7 @@ def judged(scenario, **spoiled):
     recording = RecordedDrive(scenario, VEHICLE, **spoiled).recording
     world = World(scenario, VEHICLE, recording.start_ns)
     for k, sample in enumerate(recording.samples("world")):
-        recording.add(world.sample(sample.t_ns, k, sample.x_m, sample.y_m))
+        recording.add(world.sample(sample.t_ns, k, car_at(sample.x_m, sample.y_m, sample.vx_mps)))
     verdict = evaluate(recording, scenario, VEHICLE, Stage.HIL)
     return recording, verdict, next(m for m in verdict.metrics if m.name.startswith("clearance to"))
 
@@ -132,6 +136,55 @@ def test_an_object_that_never_appeared_fails_the_run(tmp_path):
     assert verdict.reason == "slow car did not appear"
 
 
+def stopped(stop_m, scenario=None, **spoiled):
+    """The verdict on a drive that ends before the pedestrian who stays."""
+    scenario = scenario or load_scenario("pedestrian-stays")
+    speed = scenario.speed.model_copy(update={"stop_m": stop_m})
+    recording = RecordedDrive(scenario.model_copy(update={"speed": speed}), VEHICLE, **spoiled).recording
+    world = World(scenario, VEHICLE, recording.start_ns)
+    for k, sample in enumerate(recording.samples("world")):
+        recording.add(world.sample(sample.t_ns, k, car_at(sample.x_m, sample.y_m, sample.vx_mps)))
+    return evaluate(recording, scenario, VEHICLE, Stage.HIL)
+
+
+def test_a_car_that_stands_before_the_object_passes():
+    verdict = stopped(25.0)
+    assert verdict.passed, verdict.reason
+    gap_m = next(m.value for m in verdict.metrics if m.name == "final distance to pedestrian")
+    assert gap_m == pytest.approx(30.0 - 0.25 - 2.01 - 25.0, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("stop_m", "reason"),
+    [
+        (10.0, "the car ended 17.7 m before pedestrian, it was to stand within 6 m"),
+        (27.6, "pedestrian passed at 0.140 m, limit 0.3 m, at t = "),
+        (60.0, "pedestrian touched at t = "),
+    ],
+)
+def test_a_car_that_stands_too_early_too_near_or_behind_the_object_fails(stop_m, reason):
+    verdict = stopped(stop_m)
+    assert not verdict.passed
+    assert verdict.reason.startswith(reason)
+
+
+def test_a_car_that_drives_round_the_object_that_it_was_to_stand_before_fails():
+    wide = load_scenario("pedestrian-stays")
+    wide = wide.model_copy(update={"road": wide.road.model_copy(update={"left_m": 6.0})})
+    verdict = stopped(60.0, wide, left_of_reference_m=lambda station_m: 3.0)
+    assert verdict.reason == "the car was to stand before pedestrian, it ended beside or behind it"
+
+
+def test_a_gateway_that_ends_the_drive_before_the_car_stands_fails_it():
+    verdict = stopped(25.0, leaves_engaged=(6.0, "SAFE_STOP", "controller silent"))
+    assert verdict.reason == "controller silent at t = 6.00 s, the car stopped"
+
+
+def test_nothing_but_an_object_can_be_stood_before(tmp_path):
+    with pytest.raises(ScenarioError, match=r"judge\.stands_before only with the name of an object"):
+        cut_in(tmp_path, ("object_clearance_m = 0.3", 'object_clearance_m = 0.3\nstands_before = "somebody"'))
+
+
 def test_the_map_shows_the_object_where_the_car_was_closest():
     scenario = load_scenario("cut-in")
     recording, _, clearance = judged(scenario)
@@ -141,6 +194,15 @@ def test_the_map_shows_the_object_where_the_car_was_closest():
     assert drawn.is_touched
     assert drawn.label.startswith("slow car: \N{MINUS SIGN}")
     assert clearance.value < 0.0
+
+
+@pytest.mark.parametrize("name", ["pedestrian", "pedestrian-stays", "cut-in-lane-change"])
+def test_the_car_waits_for_who_crosses_stands_before_who_stays_and_follows_who_cuts_in(tmp_path, name):
+    finished = xilgate("drive", name, "--stage", "sil", "--solver", "riccati", "--out", str(tmp_path / "run"))
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert finished.returncode == 0, summary["reason"]
+    (clearance,) = [m["value"] for m in summary["metrics"] if m["name"].startswith("clearance to")]
+    assert 1.5 < clearance < 15.0
 
 
 @pytest.mark.parametrize("name", ["parking", "cut-in"])

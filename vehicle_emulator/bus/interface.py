@@ -1,20 +1,20 @@
 """python-can interface `xilgate`: a node on the emulated bus, for any tool that speaks python-can.
 
-It behaves as SocketCAN does: a node does not hear itself, and `send` without a timeout fails at once when the bus takes no
-more. There is no bit rate to set.
+It behaves as SocketCAN does: a node does not hear itself unless it asks to, `send` without a timeout fails at once when the bus takes
+no more, and error frames tell what fault confinement makes of the node. The bit rate is the hub's.
 """
 
-import contextlib
 import select
-import socket
 import time
 
 import can
-from can.typechecking import CanFilters
+from can.typechecking import CanFilter, CanFilters
 
-from vehicle_emulator.bus import wire
-from vehicle_emulator.bus.channel import BusError, socket_path
-from vehicle_emulator.bus.core import BITRATE_SWITCH, ERROR, ERROR_STATE_INDICATOR, EXTENDED, FD, REMOTE, BusFrame
+from vehicle_emulator.bus import error_frames, wire
+from vehicle_emulator.bus.channel import BusError, address_of, open_socket
+from vehicle_emulator.bus.confinement import ErrorState
+from vehicle_emulator.bus.connection import Connection, connection_of
+from vehicle_emulator.bus.frame import BITRATE_SWITCH, ERROR, ERROR_STATE_INDICATOR, EXTENDED, FD, REMOTE, BusFrame
 
 DEFAULT_CHANNEL = "bus0"
 
@@ -23,9 +23,14 @@ _FLAG_OF_ATTRIBUTE = {
     "is_extended_id": EXTENDED,
     "is_remote_frame": REMOTE,
     "is_fd": FD,
-    "is_error_frame": ERROR,
     "bitrate_switch": BITRATE_SWITCH,
     "error_state_indicator": ERROR_STATE_INDICATOR,
+}
+_BUS_STATE = {
+    ErrorState.ACTIVE: can.BusState.ACTIVE,
+    ErrorState.WARNING: can.BusState.ACTIVE,
+    ErrorState.PASSIVE: can.BusState.PASSIVE,
+    ErrorState.BUS_OFF: can.BusState.ERROR,
 }
 
 
@@ -33,10 +38,13 @@ class XilgateBus(can.BusABC):
     """Connection to the hub of one channel.
 
     Args:
-        channel: name of the channel.
-        can_filters: see `can.BusABC.set_filters`; applied in this process.
+        channel: name of the channel, or tcp://127.0.0.1:PORT.
+        can_filters: see `can.BusABC.set_filters`; the hub applies them, so that a node is not woken for what it does not want.
         fd: whether frames with up to 64 bytes may be sent.
-        receive_own_messages: not supported, because the hub delivers a frame to every node but its sender.
+        receive_own_messages: whether it hears its own frames, when they are through and with `is_rx` False.
+        berr_reporting: whether every bus error is reported, as `ip link set ... berr-reporting on` does, and not changes of the
+            state alone.
+        restart_ms: time after which the node leaves bus-off by itself [ms], 0: only by `restart`; None: as the hub has it.
         kwargs: settings of other interfaces, such as a bit rate, which mean nothing here.
 
     Raises:
@@ -49,33 +57,73 @@ class XilgateBus(can.BusABC):
         can_filters: CanFilters | None = None,
         fd: bool = False,
         receive_own_messages: bool = False,
+        *,
+        berr_reporting: bool = False,
+        restart_ms: int | None = None,
         **kwargs: object,
     ) -> None:
-        if receive_own_messages:
-            raise can.CanInitializationError("interface xilgate cannot receive its own messages")
         self._channel = str(channel)
-        self._socket = _connect(self._channel)
-        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
+        self._error_state = ErrorState.ACTIVE
+        self._own_messages, self._bus_errors, self._restart_ms = receive_own_messages, berr_reporting, restart_ms
         self.channel_info = f"xilgate channel '{self._channel}'"
+        self._connection = _connect(self._channel)
+        self._can_protocol = can.CanProtocol.CAN_FD if fd else can.CanProtocol.CAN_20
         super().__init__(channel=channel, can_filters=can_filters, **kwargs)
+
+    @property
+    def state(self) -> can.BusState:
+        """State of fault confinement, as of the frames read so far: ERROR is bus-off."""
+        return _BUS_STATE[self._error_state]
+
+    @state.setter
+    def state(self, new_state: can.BusState) -> None:
+        raise NotImplementedError("fault confinement sets the state; `restart` leaves bus-off")
 
     def fileno(self) -> int:
         """File descriptor that is readable when a frame has arrived or the hub has gone."""
-        return self._socket.fileno()
+        return self._connection.fileno()
+
+    def restart(self) -> None:
+        """Leave bus-off, as `ip link set ... type can restart` does: the node takes part again after 128 x 11 recessive bits.
+
+        Raises:
+            can.CanOperationError: the hub has gone, or takes no more.
+        """
+        self._transfer(wire.pack_control(wire.Restart()), 0.0)
+
+    def disturb(self, arbitration_id: int | None, count: int) -> None:
+        """Destroy the next attempts to send a frame on the wire by a bit error, whoever sends it.
+
+        Args:
+            arbitration_id: of the frames to destroy; None for any.
+            count: attempts, retransmissions included, 1 to 1,000,000; 32 in a row take a sender to bus-off.
+
+        Raises:
+            can.CanOperationError: the hub has gone, or takes no more.
+        """
+        self._transfer(wire.pack_control(wire.Disturb(arbitration_id, count)), 0.0)
+
+    def _apply_filters(self, filters: CanFilters | None) -> None:
+        settings = wire.Settings(_wire_filters(filters), self._own_messages, self._bus_errors, self._restart_ms)
+        self._transfer(wire.pack_control(settings), _JOIN_TIMEOUT_S)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
-            packet = self._socket.recv(wire.PACKET_BYTES)
+            self._connection.flush()
+            packet = self._connection.receive()
         except BlockingIOError:
             if not self._wait(select.POLLIN, timeout):
                 return None, False
             # Without a wait this time: another thread may have taken the frame, and the caller keeps count of its time.
             return self._recv_internal(0.0)
-        except OSError as error:
-            raise can.CanOperationError(f"{self.channel_info}: {error.strerror}", error.errno) from error
+        except (OSError, wire.WireError) as error:
+            raise can.CanOperationError(f"{self.channel_info}: {error}") from error
         if not packet:
             raise can.CanOperationError(f"{self.channel_info}: the hub has gone")
-        return self._message(packet), False
+        content = wire.unpack(packet)
+        # The hub says nothing but frames to a node that has joined. Filters are applied again, for frames that were on their way
+        # when they were changed; error frames pass whatever they are, as with SocketCAN.
+        return (self._message(*content), bool(content[0].flags & ERROR)) if isinstance(content, tuple) else (None, False)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand a frame to the bus.
@@ -85,82 +133,127 @@ class XilgateBus(can.BusABC):
             timeout: longest wait for room in the transmit buffer [s]; none without it.
 
         Raises:
-            can.CanOperationError: not a frame that this bus carries, transmit buffer full, or the hub has gone.
+            can.CanOperationError: not a frame that this bus carries, transmit buffer full, bus-off, or the hub has gone.
         """
-        packet = self._packet(msg)
-        deadline_s = time.monotonic() + (timeout or 0.0)
-        while True:
-            try:
-                self._socket.send(packet)
-                return
-            except BlockingIOError as error:
-                if not self._wait(select.POLLOUT, deadline_s - time.monotonic()):
-                    raise can.CanOperationError(f"{self.channel_info}: transmit buffer full") from error
-            except OSError as error:
-                raise can.CanOperationError(f"{self.channel_info}: the hub has gone", error.errno) from error
+        if self._error_state is ErrorState.BUS_OFF:
+            raise can.CanOperationError(f"{self.channel_info}: bus-off")
+        self._transfer(self._packet(msg), timeout or 0.0)
 
     def shutdown(self) -> None:
         """Leave the bus; can be called again."""
         super().shutdown()
-        # Closing alone would leave another thread waiting in `recv`.
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
+        self._connection.close()
+
+    def _transfer(self, packet: bytes, timeout_s: float) -> None:
+        deadline_s = time.monotonic() + timeout_s
+        try:
+            while True:
+                try:
+                    self._connection.send(packet)
+                    break
+                except BlockingIOError as error:
+                    if not self._wait(select.POLLOUT, deadline_s - time.monotonic()):
+                        raise can.CanOperationError(f"{self.channel_info}: transmit buffer full") from error
+        except OSError as error:
+            raise can.CanOperationError(f"{self.channel_info}: the hub has gone", error.errno) from error
 
     def _wait(self, event: int, timeout_s: float | None) -> bool:
         """Whether the socket is ready for an event, or at its end, before the timeout [s]."""
         if timeout_s is not None and timeout_s <= 0.0:
             return False
         poll = select.poll()
-        poll.register(self._socket, event)
+        poll.register(self._connection.fileno(), event)
         return bool(poll.poll(None if timeout_s is None else timeout_s * 1000.0))
 
     def _packet(self, msg: can.Message) -> bytes:
+        if msg.is_error_frame:
+            raise can.CanOperationError(f"{self.channel_info}: an error frame cannot be sent; `disturb` makes errors")
         if msg.is_fd and self._can_protocol is not can.CanProtocol.CAN_FD:
             raise can.CanOperationError(f"{self.channel_info}: opened without fd=True, cannot send a CAN FD frame")
         flags = sum(flag for attribute, flag in _FLAG_OF_ATTRIBUTE.items() if getattr(msg, attribute))
-        data = b"" if msg.is_remote_frame else bytes(msg.data)
+        frame = BusFrame(msg.arbitration_id, b"" if msg.is_remote_frame else bytes(msg.data), flags, msg.dlc)
         try:
-            return wire.pack(BusFrame(msg.arbitration_id, data, flags, msg.dlc), 0)
+            wire.check(frame)
         except wire.WireError as error:
             raise can.CanOperationError(f"{self.channel_info}: {error}") from error
+        return wire.pack(frame, time.monotonic_ns())
 
-    def _message(self, packet: bytes) -> can.Message:
-        frame, t_ns = wire.unpack(packet)
+    def _message(self, frame: BusFrame, t_ns: int, is_own: bool) -> can.Message:
+        flags = frame.flags
+        if flags & ERROR and (state := error_frames.state_in(frame)) is not None:
+            self._error_state = state
         return can.Message(
             timestamp=t_ns * 1e-9,
             arbitration_id=frame.arbitration_id,
-            is_extended_id=bool(frame.flags & EXTENDED),
-            is_remote_frame=bool(frame.flags & REMOTE),
-            is_error_frame=bool(frame.flags & ERROR),
-            is_fd=bool(frame.flags & FD),
-            bitrate_switch=bool(frame.flags & BITRATE_SWITCH),
-            error_state_indicator=bool(frame.flags & ERROR_STATE_INDICATOR),
+            is_extended_id=bool(flags & EXTENDED),
+            is_remote_frame=bool(flags & REMOTE),
+            is_error_frame=bool(flags & ERROR),
+            is_fd=bool(flags & FD),
+            is_rx=not is_own,
+            bitrate_switch=bool(flags & BITRATE_SWITCH),
+            error_state_indicator=bool(flags & ERROR_STATE_INDICATOR),
             channel=self._channel,
             dlc=frame.length_bytes,
             data=frame.data,
         )
 
 
-def _connect(channel: str) -> socket.socket:
-    """Socket of a node that has joined the channel."""
+def _wire_filters(filters: CanFilters | None) -> tuple[wire.Filter, ...] | None:
+    """Filters for the hub; None, everything, where there are more than it takes: `can.BusABC` applies them all the same."""
+    if filters is None or len(filters) > wire.MAX_FILTERS:
+        return None
+    return tuple(wire.Filter(one["can_id"], one["can_mask"], _extended(one)) for one in filters)
+
+
+def _extended(one: CanFilter) -> bool | None:
+    return bool(one["extended"]) if "extended" in one else None
+
+
+def _connect(channel: str) -> Connection:
+    """Connection of a node that has joined the channel."""
     try:
-        path = socket_path(channel)
+        address = address_of(channel)
     except BusError as error:
         raise can.CanInitializationError(str(error)) from error
-    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    connection.settimeout(_JOIN_TIMEOUT_S)
+    place = f"port {address[1]}" if isinstance(address, tuple) else str(address)
+    connected = open_socket(address)
+    connected.settimeout(_JOIN_TIMEOUT_S)
     try:
-        connection.connect(str(path))
-        greeting = connection.recv(wire.PACKET_BYTES)
+        connected.connect(address if isinstance(address, tuple) else str(address))
+        connection = connection_of(connected)
     except (FileNotFoundError, ConnectionRefusedError) as error:
-        connection.close()
-        raise can.CanInitializationError(f"no hub serves xilgate channel {channel!r} ({path}); `xilgate bus` starts one") from error
+        connected.close()
+        raise can.CanInitializationError(f"no hub serves xilgate channel {channel!r} ({place}); `xilgate bus` starts one") from error
     except OSError as error:
+        connected.close()
+        raise can.CanInitializationError(f"the hub of xilgate channel {channel!r} does not answer ({place}): {error}") from error
+    try:
+        _say_hello(connection)
+    except (OSError, wire.WireError) as error:
         connection.close()
-        raise can.CanInitializationError(f"the hub of xilgate channel {channel!r} does not answer ({path}): {error}") from error
-    if greeting != wire.HELLO:
-        connection.close()
-        raise can.CanInitializationError(f"the hub of xilgate channel {channel!r} refuses: full, or of another version ({path})")
-    connection.setblocking(False)
+        is_silent = isinstance(error, TimeoutError)
+        what = "does not answer" if is_silent else "refuses: full, or of another version"
+        raise can.CanInitializationError(f"the hub of xilgate channel {channel!r} {what} ({place})") from error
     return connection
+
+
+def _say_hello(connection: Connection) -> None:
+    """Join.
+
+    Raises:
+        TimeoutError: no answer.
+        OSError, WireError: an answer that is no welcome.
+    """
+    connection.send(wire.pack_control(wire.Hello(wire.VERSION)))
+    poll = select.poll()
+    poll.register(connection.fileno(), select.POLLIN)
+    deadline_s = time.monotonic() + _JOIN_TIMEOUT_S
+    while (left_s := deadline_s - time.monotonic()) > 0.0:
+        poll.poll(left_s * 1000.0)
+        try:
+            if wire.unpack(connection.receive()) == wire.Hello(wire.VERSION):
+                return
+        except BlockingIOError:
+            continue
+        raise ConnectionRefusedError
+    raise TimeoutError

@@ -4,11 +4,14 @@ ISO 8855 axes: x forward, y left, z up; angles and steering to the left, roll to
 about x and y). The reference point is the centre of gravity of the whole car in its design position.
 """
 
+from collections.abc import Callable
 from enum import StrEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 GRAVITY_MPS2 = 9.81
 
+Progress = Callable[[str], None]
+"""Told in one line each what takes time."""
 Wheels = tuple[float, float, float, float]
 """One number for each wheel: front left, front right, rear left, rear right."""
 
@@ -110,6 +113,23 @@ class Plant(Protocol):
     def step(self, dt_s: float, inputs: PlantInputs) -> PlantState:
         """Advance by `dt_s` (1 ms) with the inputs held and return the state reached."""
         ...
+
+
+@runtime_checkable
+class LiftablePlant(Plant, Protocol):
+    """A car that can hang on a lift, and be the virtual car of one that does; see `vehicle_emulator.lift`."""
+
+    def on_the_lift(self) -> Plant:
+        """The same car at rest with its wheels in the air, where it started."""
+        ...
+
+    def impose_steering(self, angle_rad: float, rate_radps: float) -> None:
+        """Set angle and rate of the steering wheel; the next step starts from them."""
+        ...
+
+
+def silent(_: str) -> None:
+    """A progress that tells nobody."""
 
 
 class RoadPoint(NamedTuple):

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from vehicle_emulator.bus.hub import Hub
+from vehicle_emulator.bus.hub import Hub, HubOptions
+
+FAST = HubOptions(bitrate_bps=1_000_000, tcp_port=0)
 
 
 @pytest.fixture(autouse=True)
@@ -19,10 +21,10 @@ def runtime_directory(monkeypatch):
 
 
 @contextmanager
-def serving(channel: str):
+def serving(channel: str, options: HubOptions = FAST):
     """A hub whose turns run in a thread, closed at the end."""
     stop = threading.Event()
-    with Hub(channel) as hub:
+    with Hub(channel, options) as hub:
 
         def turns():
             while not stop.is_set():
@@ -41,3 +43,9 @@ def serving(channel: str):
 def hub():
     with serving("bus0") as served:
         yield served
+
+
+@pytest.fixture(params=["bus0", "tcp"])
+def channel(request, hub):
+    """The hub's channel, by its name and by its port."""
+    return f"tcp://127.0.0.1:{hub.tcp_port}" if request.param == "tcp" else request.param

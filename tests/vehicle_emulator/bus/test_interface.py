@@ -3,10 +3,15 @@
 import asyncio
 import threading
 import time
+from itertools import pairwise
 
 import can
 import pytest
 
+from tests.vehicle_emulator.bus.conftest import serving
+from vehicle_emulator.bus.bits import frame_bits
+from vehicle_emulator.bus.frame import BusFrame
+from vehicle_emulator.bus.hub import HubOptions
 from vehicle_emulator.bus.interface import XilgateBus
 
 PATIENCE_S = 20.0
@@ -16,33 +21,42 @@ MESSAGES = {
     "empty": can.Message(arbitration_id=0, is_extended_id=False),
     "extended": can.Message(arbitration_id=0x1FFFFFFF, data=bytes(range(8))),
     "remote": can.Message(arbitration_id=0x100, is_extended_id=False, is_remote_frame=True, dlc=5),
-    "error": can.Message(arbitration_id=0x40, is_extended_id=False, is_error_frame=True, data=bytes(8)),
     "fd": can.Message(arbitration_id=0x200, is_extended_id=False, is_fd=True, bitrate_switch=True, data=bytes(range(64))),
     "fd passive": can.Message(arbitration_id=0x201, is_fd=True, error_state_indicator=True, data=bytes(12)),
 }
 
 
 @pytest.fixture
-def pair(hub):
-    with can.Bus(interface="xilgate", channel="bus0", fd=True) as a, can.Bus(interface="xilgate", channel="bus0") as b:
+def pair(channel):
+    with can.Bus(interface="xilgate", channel=channel, fd=True) as a, can.Bus(interface="xilgate", channel=channel) as b:
         yield a, b
 
 
-def test_entry_point_gives_this_class(pair):
+def standard(arbitration_id: int, data: bytes = b"") -> can.Message:
+    return can.Message(arbitration_id=arbitration_id, is_extended_id=False, data=data)
+
+
+def receive(bus: can.BusABC) -> can.Message:
+    message = bus.recv(timeout=PATIENCE_S)
+    assert message is not None
+    return message
+
+
+def test_entry_point_gives_this_class(pair, channel):
     assert all(type(bus) is XilgateBus for bus in pair)
-    assert str(pair[0]) == "xilgate channel 'bus0'"
+    assert str(pair[0]) == f"xilgate channel '{channel}'"
     assert pair[0].protocol is can.CanProtocol.CAN_FD
     assert pair[1].protocol is can.CanProtocol.CAN_20
 
 
 @pytest.mark.parametrize("message", MESSAGES.values(), ids=MESSAGES.keys())
-def test_every_kind_of_frame_arrives_as_sent(pair, message):
+def test_every_kind_of_frame_arrives_as_sent(pair, channel, message):
     a, b = pair
     before_s = time.time()
     a.send(message)
-    received = b.recv(timeout=PATIENCE_S)
+    received = receive(b)
     assert received.equals(message, timestamp_delta=None, check_channel=False)
-    assert received.channel == "bus0"
+    assert received.channel == channel
     assert received.is_rx
     # Wide, because the wall clock may be set while the test runs.
     assert before_s - 1.0 < received.timestamp < time.time() + 1.0
@@ -54,6 +68,7 @@ def test_every_kind_of_frame_arrives_as_sent(pair, message):
         (can.Message(arbitration_id=0x800, is_extended_id=False), "0x800 outside"),
         (can.Message(arbitration_id=1, is_extended_id=False, data=bytes(9)), "CAN frame of 9 bytes"),
         (can.Message(arbitration_id=1, is_extended_id=False, data=bytes(4), dlc=2), "4 bytes of data in a frame of length 2"),
+        (can.Message(arbitration_id=4, is_error_frame=True, data=bytes(8)), "an error frame cannot be sent; `disturb` makes errors"),
     ],
 )
 def test_impossible_frames_are_refused_before_they_are_sent(pair, message, cause):
@@ -72,19 +87,65 @@ def test_filters(pair):
     a, b = pair
     b.set_filters([{"can_id": 0x100, "can_mask": 0x7F0, "extended": False}])
     for arbitration_id in (0x0FF, 0x105, 0x110):
-        a.send(can.Message(arbitration_id=arbitration_id, is_extended_id=False))
+        a.send(standard(arbitration_id))
     a.send(can.Message(arbitration_id=0x100, is_extended_id=True))
-    a.send(can.Message(arbitration_id=0x10F, is_extended_id=False))
-    assert [b.recv(timeout=PATIENCE_S).arbitration_id for _ in range(2)] == [0x105, 0x10F]
+    a.send(standard(0x10F))
+    assert [receive(b).arbitration_id for _ in range(2)] == [0x105, 0x10F]
+    assert b.recv(timeout=0.05) is None
+    b.set_filters()
+    a.send(standard(0x0FF))
+    assert receive(b).arbitration_id == 0x0FF
+
+
+def test_filters_without_a_format_pass_both(pair):
+    a, b = pair
+    b.set_filters([{"can_id": 0x100, "can_mask": 0x1FFFFFFF}, {"can_id": 0x200, "can_mask": 0x1FFFFFFF, "extended": True}])
+    for is_extended in (False, True):
+        a.send(can.Message(arbitration_id=0x200, is_extended_id=is_extended))
+        a.send(can.Message(arbitration_id=0x100, is_extended_id=is_extended))
+    heard = [receive(b) for _ in range(3)]
+    # In any order: some of them meet in arbitration.
+    assert {(message.arbitration_id, message.is_extended_id) for message in heard} == {(0x100, False), (0x200, True), (0x100, True)}
     assert b.recv(timeout=0.05) is None
 
 
-def test_timestamps_do_not_decrease(pair):
+def test_more_filters_than_the_hub_takes_work_as_well(pair):
     a, b = pair
-    for _ in range(100):
-        a.send(MESSAGES["standard"])
-    stamps = [b.recv(timeout=PATIENCE_S).timestamp for _ in range(100)]
-    assert stamps == sorted(stamps)
+    b.set_filters([{"can_id": 0x100 + number, "can_mask": 0x7FF} for number in range(200)])
+    for arbitration_id in (0x0FF, 0x100 + 199, 0x100 + 200):
+        a.send(standard(arbitration_id))
+    assert receive(b).arbitration_id == 0x100 + 199
+    assert b.recv(timeout=0.05) is None
+
+
+def test_filters_from_the_start(hub, channel):
+    with XilgateBus("bus0") as a, XilgateBus(channel, can_filters=[{"can_id": 5, "can_mask": 0x7FF}]) as b:
+        for arbitration_id in (4, 5, 6):
+            a.send(standard(arbitration_id))
+        assert receive(b).arbitration_id == 5
+        assert b.recv(timeout=0.05) is None
+
+
+def test_own_messages_come_back_when_they_are_through(hub, channel):
+    with XilgateBus(channel, receive_own_messages=True) as a, XilgateBus("bus0") as b:
+        a.send(standard(3, b"abc"))
+        own, other = receive(a), receive(b)
+        assert not own.is_rx
+        assert other.is_rx
+        assert own.equals(other, check_direction=False, check_channel=False, timestamp_delta=0)
+        b.send(standard(4))
+        assert receive(a).is_rx
+        assert b.recv(timeout=0.05) is None
+
+
+def test_time_stamps_are_ends_of_frames(pair):
+    a, b = pair
+    for number in range(100):
+        a.send(standard(0x100, bytes([number])))
+    stamps = [(receive(b).timestamp, frame_bits(BusFrame(0x100, bytes([number]), 0, 1))[0]) for number in range(100)]
+    for (earlier_s, _), (later_s, bits) in pairwise(stamps):
+        # At 1 Mbit/s; the resolution of such a number of seconds since the epoch is 0.24 us.
+        assert later_s - earlier_s > (3 + bits) * 1e-6 - 1e-6
 
 
 def test_recv_times_out(pair):
@@ -128,13 +189,14 @@ def test_shutdown_wakes_a_waiting_thread(pair):
 def test_fileno_serves_an_event_loop(pair):
     a, b = pair
 
-    async def receive():
+    async def receive_all(count):
         reader = can.AsyncBufferedReader()
         with can.Notifier(b, [reader], loop=asyncio.get_running_loop()):
-            a.send(MESSAGES["extended"])
-            return await asyncio.wait_for(reader.get_message(), PATIENCE_S)
+            for number in range(count):
+                a.send(standard(number))
+            return [(await asyncio.wait_for(reader.get_message(), PATIENCE_S)).arbitration_id for _ in range(count)]
 
-    assert asyncio.run(receive()).arbitration_id == MESSAGES["extended"].arbitration_id
+    assert asyncio.run(receive_all(20)) == list(range(20))
 
 
 def test_periodic_sending(pair):
@@ -150,31 +212,120 @@ def test_no_hub_is_one_clear_line():
         can.Bus(interface="xilgate", channel="bus7")
 
 
+def test_no_hub_on_a_port_is_one_clear_line(hub):
+    port = hub.tcp_port
+    hub._listeners.popitem()[1].close()
+    text = rf"^no hub serves xilgate channel 'tcp://127\.0\.0\.1:{port}' \(port {port}\); `xilgate bus` starts one$"
+    with pytest.raises(can.CanInitializationError, match=text):
+        XilgateBus(f"tcp://127.0.0.1:{port}")
+
+
 def test_bad_channel_name_is_one_clear_line():
     with pytest.raises(can.CanInitializationError, match=r"^channel '\.\./x': expected 1 to 32 letters, digits, - or _$"):
         can.Bus(interface="xilgate", channel="../x")
 
 
-def test_own_messages_are_not_promised(hub):
-    with pytest.raises(can.CanInitializationError, match="cannot receive its own messages"):
-        can.Bus(interface="xilgate", channel="bus0", receive_own_messages=True)
+def errors_of(bus: can.BusABC, count: int) -> list[tuple[int, bytes, can.BusState]]:
+    """Error frames as python-can shows them, each with the state that the bus then tells."""
+    frames = []
+    for _ in range(count):
+        message = receive(bus)
+        assert message.is_error_frame
+        assert not message.is_extended_id
+        frames.append((message.arbitration_id, bytes(message.data), bus.state))
+    return frames
 
 
-def test_a_long_stream_passes_without_loss(hub):
-    count = 25_000
+ACTIVE, PASSIVE, ERROR = can.BusState.ACTIVE, can.BusState.PASSIVE, can.BusState.ERROR
+BUS_OFF_STORY = [
+    (0x204, bytes([0, 0x08, 0, 0, 0, 0, 96, 0]), ACTIVE),
+    (0x204, bytes([0, 0x20, 0, 0, 0, 0, 128, 0]), PASSIVE),
+    (0x240, bytes([0, 0, 0, 0, 0, 0, 255, 0]), ERROR),
+]
+RESTARTED = (0x300, bytes(8), ACTIVE)
+
+
+def test_bus_off_and_the_way_back(hub, channel):
+    with XilgateBus(channel, restart_ms=0) as a, XilgateBus("bus0", can_filters=[{"can_id": 0x123, "can_mask": 0x7FF}]) as b:
+        assert a.state is ACTIVE
+        a.disturb(0x123, 32)
+        a.send(standard(0x123))
+        assert errors_of(a, 3) == BUS_OFF_STORY
+        with pytest.raises(can.CanOperationError, match="bus-off"):
+            a.send(standard(0x123))
+        assert a.recv(timeout=0.05) is None
+        a.restart()
+        assert errors_of(a, 1) == [RESTARTED]
+        a.send(standard(0x123, b"again"))
+        assert bytes(receive(b).data) == b"again"
+        assert b.state is ACTIVE
+
+
+def test_bus_off_ends_by_itself_where_it_is_set_to(hub, channel):
+    with XilgateBus(channel, restart_ms=1) as a, XilgateBus("bus0"):
+        a.disturb(None, 32)
+        a.send(standard(1))
+        assert errors_of(a, 4) == [*BUS_OFF_STORY, RESTARTED]
+
+
+def test_the_hub_says_what_restarts_by_itself():
+    with serving("bus1", HubOptions(restart_ms=0)) as quiet, XilgateBus("bus1") as a, XilgateBus("bus1"):
+        a.disturb(None, 32)
+        a.send(standard(1))
+        assert errors_of(a, 3) == BUS_OFF_STORY
+        assert quiet.core.next_event_ns() is None
+        assert a.recv(timeout=0.05) is None
+
+
+def test_error_frames_pass_filters(hub):
+    with XilgateBus("bus0", can_filters=[{"can_id": 0x7FF, "can_mask": 0x7FF}]) as a, XilgateBus("bus0"):
+        a.disturb(None, 12)
+        a.send(standard(1))
+        assert errors_of(a, 1) == BUS_OFF_STORY[:1]
+
+
+def test_every_error_is_told_to_who_asks(hub, channel):
+    with XilgateBus(channel, berr_reporting=True) as a, XilgateBus("bus0") as b:
+        a.disturb(1, 2)
+        a.send(standard(1))
+        reports = errors_of(a, 2)
+        assert [(identifier, data) for identifier, data, _ in reports] == [
+            (0x288, bytes([0, 0, 0x81, 0x08, 0, 0, 8, 0])),
+            (0x288, bytes([0, 0, 0x81, 0x08, 0, 0, 16, 0])),
+        ]
+        assert receive(b).arbitration_id == 1
+
+
+def test_a_lonely_node_is_told_that_nobody_acknowledges(hub, channel):
+    with XilgateBus(channel, berr_reporting=True) as lonely:
+        lonely.send(standard(1))
+        identifier, data, _ = errors_of(lonely, 1)[0]
+        assert (identifier, data) == (0x2A0, bytes([0, 0, 0, 0x19, 0, 0, 8, 0]))
+    with XilgateBus(channel) as lonely:
+        lonely.send(standard(1))
+        assert errors_of(lonely, 2) == BUS_OFF_STORY[:2]
+        assert lonely.recv(timeout=0.05) is None
+
+
+def test_the_state_cannot_be_set(hub):
+    with XilgateBus("bus0") as bus, pytest.raises(NotImplementedError, match="`restart` leaves bus-off"):
+        bus.state = ERROR
+
+
+def test_a_long_stream_passes_without_loss(hub, channel):
+    count = 10_000
     received = []
 
     def read(bus):
         while len(received) < count and (message := bus.recv(timeout=PATIENCE_S)):
             received.append(int.from_bytes(message.data, "little"))
 
-    with XilgateBus("bus0") as a, XilgateBus("bus0") as b:
+    with XilgateBus("bus0") as a, XilgateBus(channel) as b:
         thread = threading.Thread(target=read, args=(b,))
         thread.start()
         for number in range(count):
-            # Paced by the reader, as a real bus is by its bit rate: at most 200 frames ahead of it.
             while number - len(received) > 200:
                 time.sleep(0.0005)
-            a.send(can.Message(arbitration_id=1, is_extended_id=False, data=number.to_bytes(8, "little")), timeout=PATIENCE_S)
+            a.send(standard(1, number.to_bytes(2, "little")), timeout=PATIENCE_S)
         thread.join(PATIENCE_S)
     assert received == list(range(count))

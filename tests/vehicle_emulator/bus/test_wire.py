@@ -1,11 +1,35 @@
 """Packets between hub and node: exact round trip, and a value or a `WireError` for anything else."""
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_emulator.bus.core import ERROR, EXTENDED, FD, REMOTE, BusFrame
-from vehicle_emulator.bus.wire import PACKET_BYTES, WireError, pack, unpack
+from vehicle_emulator.bus.frame import ERROR, EXTENDED, FD, REMOTE, BusFrame
+from vehicle_emulator.bus.wire import (
+    MAX_FILTERS,
+    MAX_PACKET_BYTES,
+    Disturb,
+    Filter,
+    Hello,
+    Restart,
+    Settings,
+    WireError,
+    check,
+    pack,
+    pack_control,
+    unpack,
+)
+
+CONTROLS = [
+    Hello(2),
+    Settings(),
+    Settings((Filter(0x100, 0x7F0, None), Filter(1, 2, True)), own_frames=True, bus_errors=True, restart_ms=0),
+    Settings(tuple(Filter(0x1FFFFFFF, 0x1FFFFFFF, False) for _ in range(MAX_FILTERS))),
+    Restart(),
+    Disturb(None, 32),
+    Disturb(0x1FFFFFFF, 1_000_000),
+]
 
 
 @st.composite
@@ -21,26 +45,53 @@ def frames(draw):
     )
 
 
-@given(frames(), st.integers(0, 2**62))
-def test_round_trip(frame, t_ns):
-    packet = pack(frame, t_ns)
-    assert len(packet) == PACKET_BYTES
-    assert unpack(packet) == (frame, t_ns)
+@given(frames(), st.integers(0, 2**62), st.booleans())
+def test_frames_make_the_round_trip(frame, t_ns, is_own):
+    packet = pack(frame, t_ns, is_own=is_own)
+    assert len(packet) <= MAX_PACKET_BYTES
+    assert unpack(packet) == (frame, t_ns, is_own)
 
 
-@given(st.binary(min_size=PACKET_BYTES, max_size=PACKET_BYTES))
-def test_any_packet_is_a_frame_that_packs_again_or_a_wire_error(packet):
+@pytest.mark.parametrize("control", CONTROLS, ids=lambda control: type(control).__name__)
+def test_controls_make_the_round_trip(control):
+    packet = pack_control(control)
+    assert len(packet) <= MAX_PACKET_BYTES
+    assert unpack(packet) == control
+
+
+@given(st.binary(max_size=100) | st.binary(max_size=90).map(b"\x01".__add__) | st.binary(max_size=40).map(b"\x02".__add__))
+def test_any_packet_is_something_that_packs_again_or_a_wire_error(packet):
     try:
-        frame, t_ns = unpack(packet)
+        content = unpack(packet)
     except WireError:
         return
-    assert unpack(pack(frame, t_ns)) == (frame, t_ns)
+    if isinstance(content, tuple):
+        frame, t_ns, is_own = content
+        assert unpack(pack(frame, t_ns, is_own=is_own)) == content
+    else:
+        assert unpack(pack_control(content)) == content
 
 
-@pytest.mark.parametrize("size", [0, PACKET_BYTES - 1, PACKET_BYTES + 1])
-def test_packet_of_another_size_is_refused(size):
-    with pytest.raises(WireError, match=f"packet of {size} bytes, expected {PACKET_BYTES}"):
-        unpack(bytes(size))
+@pytest.mark.parametrize(
+    ("packet", "cause"),
+    [
+        (b"", "packet of 0 bytes, expected 16 or more"),
+        (bytes(16), "packet of kind 0"),
+        (b"\x01" + bytes(14), "packet of 15 bytes"),
+        (pack(BusFrame(1, b"abc", 0, 3), 0) + b"d", "4 bytes of data in a frame of length 3"),
+        (pack(BusFrame(1, b"abc", 0, 3), 0)[:-1], "2 bytes of data in a frame of length 3"),
+        (b"\x02", "control packet"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Reboot"}), "control packet: Invalid value 'Reboot'"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Hello", "version": "2"}), "Expected `int`, got `str`"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Disturb", "arbitration_id": None, "count": 0}), "Expected `int` >= 1"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Disturb", "arbitration_id": 2**29, "count": 1}), "Expected `int` <= 536870911"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Settings", "filters": [[1, 2, None]] * 65}), "length <= 64"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Restart", "now": True}), "unknown field `now`"),
+    ],
+)
+def test_what_is_no_packet_is_refused(packet, cause):
+    with pytest.raises(WireError, match=cause):
+        unpack(packet)
 
 
 @pytest.mark.parametrize(
@@ -54,13 +105,18 @@ def test_packet_of_another_size_is_refused(size):
         (BusFrame(1, b"abc", 0, 2), "3 bytes of data in a frame of length 2"),
         (BusFrame(1, b"ab", REMOTE, 2), "2 bytes of data"),
         (BusFrame(1, b"", 0x80, 0), "unknown flags 0x80"),
+        (BusFrame(1, b"", FD | REMOTE, 0), "remote frame in CAN FD"),
+        (BusFrame(1, b"", 0x10, 0), "bit rate switch or error state indicator in a classical frame"),
     ],
 )
 def test_frames_that_no_bus_carries_are_refused(frame, cause):
     with pytest.raises(WireError, match=cause):
-        pack(frame, 0)
+        check(frame)
+    if frame.arbitration_id >= 0:
+        with pytest.raises(WireError, match=cause):
+            unpack(pack(frame, 0))
 
 
-def test_error_frames_may_carry_a_class_beyond_11_bits():
-    frame = BusFrame(0x20000 - 1, bytes(8), ERROR, 8)
-    assert unpack(pack(frame, 5)) == (frame, 5)
+def test_error_frames_carry_their_class_in_the_identifier():
+    frame = BusFrame(0x3E4, bytes(8), ERROR, 8)
+    assert unpack(pack(frame, 5)) == (frame, 5, False)

@@ -1,0 +1,78 @@
+"""Files that people write in TOML: what their sections have in common, and how a mistake in one is told."""
+
+import re
+import tomllib
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails, PydanticCustomError
+
+from dbc.errors import UserMistake
+
+_TOML_LINE = re.compile(r"at line (\d+)")
+
+
+class Section(BaseModel):
+    """A section of a file: unknown keys, numbers that are none and values of another type are refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+
+Content = TypeVar("Content", bound=Section)
+
+
+def between(low: float, high: float) -> AfterValidator:
+    """The range of a number, both ends allowed."""
+
+    def check(value: float) -> float:
+        if not low <= value <= high:
+            raise misfit(f"{low:g} to {high:g}")
+        return value
+
+    return AfterValidator(check)
+
+
+def misfit(allowed: str) -> PydanticCustomError:
+    """The error of a value that does not fit, with what would."""
+    return PydanticCustomError("fit", "allowed: {allowed}", {"allowed": allowed})
+
+
+def read_section(path: Path, content: type[Content], error_class: type[UserMistake]) -> Content:
+    """Read a TOML file.
+
+    Args:
+        content: what the file holds.
+        error_class: of the error that is raised.
+
+    Raises:
+        UserMistake: of that class. Missing file, malformed TOML, unknown or missing key, value out of range; one line per mistake,
+            each with file, key, value and what is allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        return content.model_validate(tomllib.loads(text))
+    except OSError as error:
+        raise error_class(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise error_class(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise error_class(f"{path}: not valid TOML: {error}{_quoted_line(text, str(error))}") from error
+    except ValidationError as error:
+        raise error_class("\n".join(_mistake(path, content, details) for details in error.errors())) from error
+
+
+def _quoted_line(text: str, message: str) -> str:
+    found = _TOML_LINE.search(message)
+    return f": {text.splitlines()[int(found.group(1)) - 1].strip()}" if found else ""
+
+
+def _mistake(path: Path, content: type[Section], details: ErrorDetails) -> str:
+    key = ".".join(map(str, details["loc"])) or content.__name__.lower()
+    if details["type"] == "missing":
+        return f"{path}: {key}: missing"
+    if details["type"] == "extra_forbidden":
+        return f"{path}: {key}: unknown key"
+    value: Any = details["input"]
+    shown = "" if isinstance(value, dict | list) else f" = {value!r}"
+    return f"{path}: {key}{shown}: {details['msg']}"
