@@ -16,7 +16,7 @@ from vehicle_emulator.bus.confinement import ErrorState
 from vehicle_emulator.bus.connection import Connection, connection_of
 from vehicle_emulator.bus.frame import BITRATE_SWITCH, ERROR, ERROR_STATE_INDICATOR, EXTENDED, FD, REMOTE, BusFrame
 
-DEFAULT_CHANNEL = "bus0"
+DEFAULT_CHANNEL = "robots"
 
 _JOIN_TIMEOUT_S = 5.0
 _FLAG_OF_ATTRIBUTE = {
