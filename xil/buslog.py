@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -15,6 +16,8 @@ from vehicle_emulator.bus.frame import BusFrame
 
 _NS_PER_S = 1_000_000_000
 _NS_PER_US = 1_000
+_POLL_S = 0.02
+"""A listener that waited for every frame would wake two thousand times a second, and cost whoever sends as much again."""
 
 
 class BusLog:
@@ -67,10 +70,12 @@ class BusListener:
     def _record(self, bus: can.BusABC, channel: str) -> None:
         while not self._is_closing.is_set():
             try:
-                message = bus.recv(timeout=0.2)
+                message = bus.recv(timeout=0)
             except (can.CanError, OSError):
                 return  # the bus has gone; whoever runs it says so
-            if message is not None and not (message.is_error_frame or message.is_remote_frame):
+            if message is None:
+                time.sleep(_POLL_S)
+            elif not (message.is_error_frame or message.is_remote_frame):
                 self._log.write(channel, CanFrame(message.arbitration_id, bytes(message.data), round(message.timestamp * _NS_PER_S)))
 
     @property
