@@ -141,8 +141,8 @@ class Catalogue:
         Raises:
             EncodeError: unknown signal, not a number, or outside the DBC's range.
         """
-        if unknown := values.keys() - self._signals[name].keys():
-            raise EncodeError(f"{name}: no signal {', '.join(sorted(unknown))}")
+        if not values.keys() <= (known := self._signals[name].keys()):
+            raise EncodeError(f"{name}: no signal {', '.join(sorted(values.keys() - known))}")
         return self._packings[name].pack(values, saturates)
 
     def decode(self, spec: MessageSpec, frame: CanFrame) -> dict[str, float]:

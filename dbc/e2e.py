@@ -7,13 +7,17 @@ It detects faults, not attackers.
 """
 
 from enum import Enum
+from functools import cache
 
 from e2e.p02 import e2e_p02_check, e2e_p02_protect
 
 PROFILE = "P02"
 CRC_START_BIT = 0
+CRC_BYTE = CRC_START_BIT // 8
 COUNTER_START_BIT = 8
 COUNTER_MODULUS = 16
+_COUNTER_BYTE = COUNTER_START_BIT // 8
+_COUNTER_MASK = COUNTER_MODULUS - 1
 MAX_DELTA_COUNTER = 3
 """Largest counter step that is still a continuous stream: two frames in a row may be lost."""
 
@@ -31,9 +35,13 @@ class E2EStatus(Enum):
     @property
     def is_usable(self) -> bool:
         """Whether the payload may be used."""
-        return self in (E2EStatus.INITIAL, E2EStatus.OK, E2EStatus.SOME_LOST)
+        return self in _USABLE
 
 
+_USABLE = (E2EStatus.INITIAL, E2EStatus.OK, E2EStatus.SOME_LOST)
+
+
+@cache
 def data_id_list(data_id: int) -> bytes:
     """The sixteen data ids of one message, one for each counter value: the same for all of them.
 
@@ -44,20 +52,30 @@ def data_id_list(data_id: int) -> bytes:
     return bytes([data_id]) * COUNTER_MODULUS
 
 
+def seal(payload: bytes, data_id: int, counter: int) -> bytes:
+    """The payload with this alive counter (0 to 15) and the CRC that fits."""
+    buffer = bytearray(payload)
+    buffer[_COUNTER_BYTE] = (buffer[_COUNTER_BYTE] & ~_COUNTER_MASK) | counter
+    e2e_p02_protect(buffer, data_id_list(data_id), increment_counter=False)
+    return bytes(buffer)
+
+
+def alive_counter(payload: bytes) -> int:
+    """The alive counter in a payload."""
+    return payload[_COUNTER_BYTE] & _COUNTER_MASK
+
+
 class E2EProtector:
     """Sender side of one message: writes the next counter and the CRC."""
 
     def __init__(self, data_id: int) -> None:
-        self._data_ids = data_id_list(data_id)
+        self._data_id = data_id
         self._counter = COUNTER_MODULUS - 1
 
     def protect(self, payload: bytes) -> bytes:
         """The payload with alive counter and CRC filled in."""
         self._counter = (self._counter + 1) % COUNTER_MODULUS
-        buffer = bytearray(payload)
-        buffer[1] = (buffer[1] & 0xF0) | self._counter
-        e2e_p02_protect(buffer, self._data_ids, increment_counter=False)
-        return bytes(buffer)
+        return seal(payload, self._data_id, self._counter)
 
 
 class E2EReceiver:
@@ -72,7 +90,7 @@ class E2EReceiver:
         """Judge a payload of at least two bytes."""
         if not e2e_p02_check(payload, self._data_ids, length=0):
             return E2EStatus.WRONG_CRC
-        counter = payload[1] & 0x0F
+        counter = alive_counter(payload)
         previous, self._last_counter = self._last_counter, counter
         if previous is None:
             return E2EStatus.INITIAL

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, Field
 
-from dbc.section import Section, between, misfit
+from dbc.section import NotNegative, Positive, Section, between, misfit
 
 OUTPUT_RATES_HZ = (100.0, 250.0)
 """What a navigation system of this class can be ordered with."""
@@ -16,8 +16,6 @@ def _offered(rate_hz: float) -> float:
     return rate_hz
 
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 _Coordinate = Annotated[float, between(-10.0, 10.0)]
 Place = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]  # TOML knows lists, no tuples
 

@@ -29,7 +29,7 @@ class Disturbable(Protocol):
     """A bus on which errors can be made, as the emulated one is."""
 
     def disturb(self, arbitration_id: int | None, count: int) -> None:
-        """Destroy the next transmissions of a message on the wire; None: of any."""
+        """Destroy the next transmissions of a message on the wire; None: of any. Replaces an earlier call for it; 0 takes back."""
 
 
 class CanLink:

@@ -7,12 +7,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from dbc.section import Section
-
-Number = Annotated[float, Field()]
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
+from dbc.section import NotNegative, Positive, Section, Share
 
 
 class Masses(Section):
@@ -53,11 +48,11 @@ class Axle(Section):
     bump_travel_m: Positive
     droop_travel_m: Positive
     stop_npm2: Positive
-    roll_centre_m: Number
-    hub_slope: Number
-    braking_slope: Number
-    toe_per_travel_radpm: Number
-    toe_per_force_radpn: Number
+    roll_centre_m: float
+    hub_slope: float
+    braking_slope: float
+    toe_per_travel_radpm: float
+    toe_per_force_radpn: float
     bearing_nms: NotNegative
 
 
@@ -72,35 +67,35 @@ class MagicFormula(Section):
     nominal_load_n: Positive
     p_cx1: Annotated[float, Field(ge=1.0, lt=2.0)]
     p_dx1: Positive
-    p_dx2: Number
-    p_ex1: Number
-    p_ex2: Number
-    p_ex3: Number
+    p_dx2: float
+    p_ex1: float
+    p_ex2: float
+    p_ex3: float
     p_kx1: Positive
-    p_kx2: Number
-    p_kx3: Number
+    p_kx2: float
+    p_kx3: float
     p_cy1: Annotated[float, Field(ge=1.0, lt=2.0)]
     p_dy1: Positive
-    p_dy2: Number
-    p_ey1: Number
-    p_ey2: Number
+    p_dy2: float
+    p_ey1: float
+    p_ey2: float
     p_ky1: Positive
     p_ky2: Positive
-    r_bx1: Number
-    r_bx2: Number
-    r_cx1: Number
-    r_ex1: Number
-    r_by1: Number
-    r_by2: Number
-    r_cy1: Number
-    r_ey1: Number
+    r_bx1: float
+    r_bx2: float
+    r_cx1: float
+    r_ex1: float
+    r_by1: float
+    r_by2: float
+    r_cy1: float
+    r_ey1: float
     q_bz1: NotNegative
-    q_bz2: Number
+    q_bz2: float
     q_cz1: NotNegative
-    q_dz1: Number
-    q_dz2: Number
-    q_ez1: Number
-    q_ez2: Number
+    q_dz1: float
+    q_dz2: float
+    q_ez1: float
+    q_ez2: float
 
 
 class Tyre(Section):
@@ -165,7 +160,7 @@ class SteeringColumn(Section):
     inertia_kgm2: Positive
     friction_nm: NotNegative
     ackermann_share: Share
-    mechanical_trail_m: Number
+    mechanical_trail_m: float
     assist_share: Share
     stop_nmprad2: Positive
 

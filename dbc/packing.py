@@ -85,22 +85,32 @@ class _Shifts:
     def __init__(self, message: Message) -> None:
         self._name = message.name
         self._length_bytes = message.length
-        self._fields = [Field.of(signal) for signal in message.signals]
+        fields = [Field.of(signal) for signal in message.signals]
+        # Plain tuples: they unpack in a third of the time of named ones.
+        self._unpacking = [(f.name, f.low, f.high, f.start, f.mask, f.sign, f.scale, f.offset) for f in fields]
+        self._packing = {f.name: (f.low, f.high, f.start, f.mask, ~(f.mask << f.start), f.scale, f.offset) for f in fields}
+        self._neutral_word = 0
+        self._neutral_word = self._word({f.name: f.neutral for f in fields}, saturates=False)
 
     def pack(self, values: Mapping[str, float], saturates: bool = False) -> bytes:
-        word = 0
-        for name, low, high, neutral, start, mask, _, scale, offset in self._fields:
-            value = values.get(name, neutral)
-            if not low <= value <= high:  # NaN fails both comparisons
-                if not saturates or math.isnan(value):
-                    raise EncodeError(_outside(self._name, name, value, low, high))
-                value = low if value < low else high
-            word |= (round((value - offset) / scale) & mask) << start
-        return word.to_bytes(self._length_bytes, "little")
+        return self._word(values, saturates).to_bytes(self._length_bytes, "little")
+
+    def _word(self, values: Mapping[str, float], saturates: bool) -> int:
+        word, packing = self._neutral_word, self._packing
+        for name, given in values.items():
+            low, high, start, mask, others, scale, offset = packing[name]
+            if low <= given <= high:
+                value = given
+            elif saturates and not math.isnan(given):
+                value = low if given < low else high
+            else:
+                raise EncodeError(_outside(self._name, name, given, low, high))
+            word = word & others | (round((value - offset) / scale) & mask) << start
+        return word
 
     def unpack(self, data: bytes) -> dict[str, float]:
         word, values = int.from_bytes(data, "little"), {}
-        for name, low, high, _, start, mask, sign, scale, offset in self._fields:
+        for name, low, high, start, mask, sign, scale, offset in self._unpacking:
             value = (((word >> start & mask) ^ sign) - sign) * scale + offset  # the two steps extend the sign
             if not low <= value <= high:
                 raise DecodeError(_outside(self._name, name, value, low, high))

@@ -8,11 +8,8 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from dbc.section import Section, misfit
+from dbc.section import NotNegative, Positive, Section, Share, misfit
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Curve = Annotated[tuple[Positive, ...], Field(strict=False, min_length=8, max_length=8)]
 PerGear = Annotated[tuple[Positive, ...], Field(strict=False, min_length=2, max_length=10)]
 PerShift = Annotated[tuple[Positive, ...], Field(strict=False, min_length=1, max_length=9)]

@@ -1,13 +1,8 @@
 """The part of the vehicle file that describes the driving robots. Positions and rates of pedals are shares of the learned stroke."""
 
-from typing import Annotated
+from pydantic import ValidationInfo, field_validator
 
-from pydantic import Field, ValidationInfo, field_validator
-
-from dbc.section import Section, misfit
-
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
+from dbc.section import NotNegative, Positive, Section, misfit
 
 
 class RobotParameters(Section):

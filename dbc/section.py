@@ -3,14 +3,18 @@
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from dbc.errors import UserMistake
 
 _TOML_LINE = re.compile(r"at line (\d+)")
+
+Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class Section(BaseModel):
@@ -39,25 +43,44 @@ def misfit(allowed: str) -> PydanticCustomError:
 
 
 def read_section(path: Path, content: type[Content], error_class: type[UserMistake]) -> Content:
-    """Read a TOML file.
+    """Read a TOML file: `read_toml` and `checked`."""
+    return checked(path, read_toml(path, error_class), content, error_class)
+
+
+def read_toml(path: Path, error_class: type[UserMistake]) -> dict[str, Any]:
+    """What a TOML file says.
 
     Args:
-        content: what the file holds.
         error_class: of the error that is raised.
 
     Raises:
-        UserMistake: of that class. Missing file, malformed TOML, unknown or missing key, value out of range; one line per mistake,
-            each with file, key, value and what is allowed.
+        UserMistake: of that class. Missing file or malformed TOML.
     """
     try:
         text = path.read_text(encoding="utf-8")
-        return content.model_validate(tomllib.loads(text))
+        return tomllib.loads(text)
     except OSError as error:
         raise error_class(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
         raise error_class(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
     except tomllib.TOMLDecodeError as error:
         raise error_class(f"{path}: not valid TOML: {error}{_quoted_line(text, str(error))}") from error
+
+
+def checked(path: Path, tree: dict[str, Any], content: type[Content], error_class: type[UserMistake]) -> Content:
+    """What a file says, as sections.
+
+    Args:
+        path: of the file, for messages.
+        content: what the file is to hold.
+        error_class: of the error that is raised.
+
+    Raises:
+        UserMistake: of that class. Unknown or missing key, value out of range; one line per mistake, each with file, key, value and
+            what is allowed.
+    """
+    try:
+        return content.model_validate(tree)
     except ValidationError as error:
         raise error_class("\n".join(_mistake(path, content, details) for details in error.errors())) from error
 

@@ -1,22 +1,16 @@
 """The numbers of one car, read from one TOML file in which every number carries its source."""
 
-import tomllib
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import Field, ValidationError
+from typing import Any
 
 from dbc.errors import UserMistake
 from dbc.ins import InsParameters
 from dbc.multibody import MultibodyParameters
 from dbc.powertrain import PowertrainParameters
 from dbc.robots import Robots
-from dbc.section import Section
+from dbc.section import NotNegative, Positive, Section, checked, read_toml
 
 FOCUS = Path(__file__).with_name("focus.toml")
-
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 
 
 class VehicleError(UserMistake):
@@ -82,17 +76,8 @@ def load_vehicle(path: Path = FOCUS) -> Vehicle:
     Raises:
         VehicleError: missing file, malformed TOML, number without source, unknown or missing key, value out of range.
     """
-    try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise VehicleError(f"{path}: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise VehicleError(f"{path}: not valid TOML: {error}") from error
-    try:
-        return Vehicle.model_validate(_without_sources(tree, str(path), ""))
-    except ValidationError as error:
-        lines = (f"{path}: {'.'.join(map(str, e['loc']))} = {e['input']!r}: {e['msg']}" for e in error.errors())
-        raise VehicleError("\n".join(lines)) from error
+    tree = _without_sources(read_toml(path, VehicleError), str(path), "")
+    return checked(path, tree, Vehicle, VehicleError)
 
 
 def _without_sources(tree: dict[str, Any], path: str, prefix: str) -> dict[str, Any]:

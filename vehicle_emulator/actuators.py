@@ -5,11 +5,10 @@
 `PedalSpring` is what a pedal robot pushes against. Positions are in any one unit.
 """
 
+import cmath
 import math
 from collections import deque
 from random import Random
-
-from vehicle_emulator.plants.column import second_order_transition
 
 _ROUNDING = 1e-12
 """A trajectory as close as this is where it should be."""
@@ -91,7 +90,7 @@ class MotionProfile:
         change = share * self._acceleration_limit * self._period_s
         distance, before = demand - self.position, self.rate
         if abs(distance) <= _ROUNDING and abs(before) <= change:
-            self.reset(demand)
+            self.position, self.rate, self.is_at_rate_limit = demand, 0.0, False
             return demand
         length = distance / self._period_s - 0.5 * before
         stoppable = self._stoppable_rate(abs(length), change)
@@ -176,11 +175,10 @@ class Servo:
 
     def stop_at(self, low: float, high: float) -> bool:
         """Stay within end stops; whether one was hit."""
-        stopped = min(max(self.position, low), high)
-        is_hit = stopped != self.position
-        if is_hit:
-            self.reset(stopped)
-        return is_hit
+        if low <= self.position <= high:
+            return False
+        self.reset(min(max(self.position, low), high))
+        return True
 
 
 class PedalSpring:
@@ -218,3 +216,18 @@ class PositionSensor:
     def read(self, position: float) -> float:
         """What the sensor says."""
         return quantised(position + self._random.gauss(0.0, self._noise_sigma), self._resolution)
+
+
+def second_order_transition(pole_radps: float, damping_ratio: float, period_s: float) -> tuple[float, float, float, float]:
+    """Matrix exponential of e'' + 2 zeta omega e' + omega^2 e = 0 over a period, row by row: what e and e' become."""
+    decay_radps = damping_ratio * pole_radps
+    spread_radps = cmath.sqrt(decay_radps**2 - pole_radps**2)
+    even = cmath.cosh(spread_radps * period_s).real
+    odd_s = (cmath.sinh(spread_radps * period_s) / spread_radps).real if spread_radps else period_s
+    decay = math.exp(-decay_radps * period_s)
+    return (
+        decay * (even + decay_radps * odd_s),
+        decay * odd_s,
+        -decay * pole_radps**2 * odd_s,
+        decay * (even - decay_radps * odd_s),
+    )

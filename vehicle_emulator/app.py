@@ -125,7 +125,8 @@ def run(options: EmulatorOptions, stop: threading.Event) -> None:
     with BusSet(options.buses, catalogue) as buses, Publisher(Source.EMULATOR, options.telemetry_base_port) as publisher:
         start_ns = time.monotonic_ns()
         emulator = Emulator(setup, catalogue, start_ns)
-        service = EmulatorService(fault_operations(emulator.faults, catalogue) | lift_operations(emulator.car, lambda: emulator.inputs))
+        lift = lift_operations(emulator.car, lambda: emulator.inputs, emulator.robot_actions)
+        service = EmulatorService(fault_operations(emulator.faults, catalogue) | lift)
         publisher.serve(SERVICE, service.answer)
         become_realtime(EMULATOR_PRIORITY)
         _drive(emulator, StepClock(start_ns), buses, publisher, service, stop)

@@ -11,7 +11,7 @@ from dbc.vehicle import Vehicle
 from vehicle_emulator import car_bus, ins
 from vehicle_emulator.car_bus import CarBus
 from vehicle_emulator.faults.condition import Situation
-from vehicle_emulator.faults.effects import Disturbance
+from vehicle_emulator.faults.effects import ActiveFaults, Disturbance
 from vehicle_emulator.faults.engine import FaultEngine
 from vehicle_emulator.faults.spec import FaultSpec
 from vehicle_emulator.ins import NavigationSystem
@@ -20,6 +20,7 @@ from vehicle_emulator.plants import make_plant
 from vehicle_emulator.plants.interface import PlantInputs, PlantState, Progress, Road, RoadPoint, silent
 from vehicle_emulator.road import RoadDescription, make_road
 from vehicle_emulator.robots import system
+from vehicle_emulator.robots.supervisor import RELEASED, STOPS, SystemState
 from vehicle_emulator.robots.system import RobotSystem
 from vehicle_emulator.safety_driver import SafetyDriver
 
@@ -28,6 +29,7 @@ STEP_NS = 1_000_000
 STEP_S = STEP_NS * 1e-9
 DEFAULT_PLANT = "multibody"
 _GATEWAY = "GW"
+_ACTIVE = (SystemState.ENGAGED, *STOPS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +78,7 @@ class Emulator:
     """The car on its buses: every message of the DBC that the gateway does not send.
 
     Deterministic: the same setup and frames give the same bytes. Until the robots are engaged for the first time, a virtual safety
-    driver holds the start speed, or the standing car; afterwards nobody touches pedals or wheel but the robots.
+    driver holds the start speed, or the standing car; afterwards he only holds a slow car while the robots are not active.
 
     Args:
         start_ns: monotonic time of the start [ns]; the first step is due one `STEP_NS` later.
@@ -107,8 +109,9 @@ class Emulator:
         )  # fmt: skip
         self._car_bus = CarBus(catalogue)
         self._senders = {name: _Sender(catalogue, name) for name in _OWN_MESSAGES if name in catalogue.by_name}
-        self._cycles = [_Cycle(name, catalogue.by_name[name].cycle_time_ns, start_ns) for name in _CYCLIC_MESSAGES]
+        self._timetable = _Timetable({name: catalogue.by_name[name].cycle_time_ns for name in _CYCLIC_MESSAGES}, start_ns)
         self.faults = FaultEngine(setup.faults, setup.seed, start_ns, catalogue)
+        self._active: ActiveFaults | None = None
         self.inputs = PlantInputs()
         self.disturbances: tuple[Disturbance, ...] = ()
 
@@ -116,14 +119,21 @@ class Emulator:
         """Advance the car by `STEP_NS` to `now_ns`, with the frames that have arrived; the frames that are due now."""
         robots, before = self._robots, self.car.state
         faults = self.faults.update(now_ns, Situation(before, robots.is_engaged))
-        self._road.factor, self._ins.faults, self.disturbances = faults.friction, faults.ins, faults.disturbances
-        robots.faults.update(faults.robots)
-        driver = faults.driven_by(self._driver.step(STEP_S, before, robots.was_engaged))
+        if faults is not self._active:
+            self._suffer(faults)
+        is_active = robots.supervisor.state in _ACTIVE
+        driver = faults.driven_by(self._driver.step(STEP_S, before, was_engaged=robots.was_engaged, are_robots_active=is_active))
         heard = self.faults.incoming(now_ns, list(frames))
         inputs = robots.step(now_ns, heard, before, driver)
         self.inputs = inputs if faults.plant == inputs.faults else inputs._replace(faults=faults.plant)
         self._ins.observe(self.car.step(STEP_S, self.inputs))
         return self.faults.outgoing(now_ns, [self._senders[name].frame(now_ns, values) for name, values in self._due(now_ns)])
+
+    def _suffer(self, faults: ActiveFaults) -> None:
+        """Hand what is wrong from now on to those whom it concerns."""
+        self._active = faults
+        self._road.factor, self._ins.faults, self.disturbances = faults.friction, faults.ins, faults.disturbances
+        self._robots.faults.update(faults.robots)
 
     def truth(self) -> GroundTruth:
         """The state reached by the last step."""
@@ -131,13 +141,23 @@ class Emulator:
         engaged, lifted = self._robots.is_engaged, self.car.is_lifted
         return GroundTruth(state, state.steering_wheel_rad, *self._robots.pedals, are_robots_engaged=engaged, is_lifted=lifted)
 
+    def robot_actions(self) -> list[str]:
+        """What the robots do or may do now, in words; nothing when they are neutral: released, with their pedals at rest."""
+        state, pedals = self._robots.supervisor.state, self._robots.pedals
+        conditions = (
+            (state not in RELEASED, f"the robot system is in {state}"),
+            (pedals.accelerator_norm > 0.0, f"the accelerator robot is at {100.0 * pedals.accelerator_norm:.0f} %"),
+            (pedals.brake_norm > 0.0, f"the brake robot is at {100.0 * pedals.brake_norm:.0f} %"),
+        )
+        return [action for is_true, action in conditions if is_true]
+
     def _due(self, now_ns: int) -> list[tuple[str, Mapping[str, float]]]:
         """Messages to send now, with their signals in the units of the DBC."""
-        cyclic = [cycle.name for cycle in self._cycles if cycle.is_due(now_ns)]
-        messages: list[tuple[str, Mapping[str, float]]] = [
-            (name, self._robots.status(name)) for name in cyclic if name in system.STATUS_MESSAGES and not self._robots.is_silent(name)
-        ]
-        messages += [(name, self._car_bus.message(name, self.car.state, self.inputs)) for name in cyclic if name in car_bus.MESSAGES]
+        messages: list[tuple[str, Mapping[str, float]]] = []
+        if cyclic := self._timetable.due(now_ns):
+            robots = [name for name in cyclic if name in system.STATUS_MESSAGES and not self._robots.is_silent(name)]
+            messages += [(name, self._robots.status(name)) for name in robots]
+            messages += [(name, self._car_bus.message(name, self.car.state, self.inputs)) for name in cyclic if name in car_bus.MESSAGES]
         messages += [(name, self._ins.message(name, now_ns)) for name in self._ins.due(now_ns)]
         return messages
 
@@ -155,20 +175,28 @@ class _SlipperyRoad:
         return point if self.factor == 1.0 else point._replace(friction=self.factor * point.friction)
 
 
-class _Cycle:
-    """When a cyclic message is due: first one cycle after the start; what a stall has made late is skipped, not sent in a burst."""
+class _Timetable:
+    """When cyclic messages are due: first one cycle after the start; what a stall has made late is skipped, not sent in a burst.
 
-    def __init__(self, name: str, cycle_ns: int, start_ns: int) -> None:
-        self.name = name
-        self._cycle_ns = cycle_ns
-        self._due_ns = start_ns + cycle_ns
+    Args:
+        cycles_ns: of each message [ns].
+    """
 
-    def is_due(self, now_ns: int) -> bool:
-        """Whether the message is to be sent."""
-        if now_ns < self._due_ns:
-            return False
-        self._due_ns += self._cycle_ns * (1 + (now_ns - self._due_ns) // self._cycle_ns)
-        return True
+    def __init__(self, cycles_ns: Mapping[str, int], start_ns: int) -> None:
+        self._cycles_ns = cycles_ns
+        self._due_ns = {name: start_ns + cycle_ns for name, cycle_ns in cycles_ns.items()}
+        self._next_ns = min(self._due_ns.values())
+
+    def due(self, now_ns: int) -> list[str]:
+        """The messages to be sent."""
+        if now_ns < self._next_ns:
+            return []
+        names = [name for name, due_ns in self._due_ns.items() if due_ns <= now_ns]
+        for name in names:
+            cycle_ns = self._cycles_ns[name]
+            self._due_ns[name] += cycle_ns * (1 + (now_ns - self._due_ns[name]) // cycle_ns)
+        self._next_ns = min(self._due_ns.values())
+        return names
 
 
 class _Sender:

@@ -6,7 +6,7 @@ steering-wheel angle and pedal positions, not by what was commanded. The navigat
 wheels, engine and gear are those of the bench, so that the wheel speeds disagree with the motion, as they do on a real lift.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 from dbc.errors import UserMistake
@@ -18,6 +18,7 @@ MAX_WHEEL_SPEED_RADPS = 0.5
 MAX_STEERING_RATE_RADPS = 0.1
 MAX_ENGINE_SPEED_RADPS = 110.0
 """Above every idle speed and below every pull: 1,050 rpm."""
+_STEP_S = 0.001
 
 
 class LiftRefused(UserMistake):
@@ -69,7 +70,10 @@ class Car:
             LiftRefused: it moves, robots or driver act on it, or this kind of car cannot hang.
         """
         self._refuse_unless_still("raised", inputs)
-        self._lifted = self._lifted or _lifted(self._road_car)
+        if self._lifted is None:
+            lifted = _lifted(self._road_car)
+            lifted.bench.step(_STEP_S, inputs)  # its instruments do not show before
+            self._lifted = lifted
 
     def lower_car(self, inputs: PlantInputs) -> None:
         """Set the car on the ground, where its virtual self stands; see `raise_car`."""
@@ -82,7 +86,7 @@ class Car:
         engine_radps = max(state.engine_speed_radps for state in states)
         rate_radps = max(abs(state.steering_wheel_rate_radps) for state in states)
         conditions = (
-            (fastest > MAX_WHEEL_SPEED_RADPS, f"a wheel turns at {fastest:.1f} rad/s, allowed {MAX_WHEEL_SPEED_RADPS:g}"),
+            (fastest >= MAX_WHEEL_SPEED_RADPS, f"a wheel turns at {fastest:.2f} rad/s, allowed below {MAX_WHEEL_SPEED_RADPS:g}"),
             (engine_radps > MAX_ENGINE_SPEED_RADPS, f"the engine turns at {engine_radps:.0f} rad/s, allowed {MAX_ENGINE_SPEED_RADPS:g}"),
             (rate_radps > MAX_STEERING_RATE_RADPS, f"the steering turns at {rate_radps:.2f} rad/s, allowed {MAX_STEERING_RATE_RADPS:g}"),
             (inputs.steering.torque_limit_nm > 0.0, "the steering robot is powered"),
@@ -107,16 +111,18 @@ _MEASURED_ON_THE_BENCH = (
 
 
 def _lifted(car: Plant) -> _Lifted:
-    if not isinstance(car, LiftablePlant):
+    if not isinstance(car, LiftablePlant) or not isinstance(bench := car.on_the_lift(), LiftablePlant):
         raise LiftRefused("this kind of car cannot hang on a lift; plant multibody can")
-    return _Lifted(car.on_the_lift(), car)
+    bench.impose_steering(car.state.steering_wheel_rad, car.state.steering_wheel_rate_radps)
+    return _Lifted(bench, car)
 
 
-def lift_operations(car: Car, inputs: Callable[[], PlantInputs]) -> dict[str, Operation]:
+def lift_operations(car: Car, inputs: Callable[[], PlantInputs], robot_actions: Callable[[], Sequence[str]]) -> dict[str, Operation]:
     """The operations on the lift of a running emulator, by name; they answer where the car is.
 
     Args:
         inputs: what acts on the car now.
+        robot_actions: what the robots do now, in words; it must be nothing.
     """
 
     def operation(act: Callable[[PlantInputs], None]) -> Operation:
@@ -126,6 +132,8 @@ def lift_operations(car: Car, inputs: Callable[[], PlantInputs]) -> dict[str, Op
             return lambda _: done()
 
         def done() -> object:
+            if actions := robot_actions():
+                raise LiftRefused(f"the car stays where it is: {'; '.join(actions)}")
             act(inputs())
             return {"is_lifted": car.is_lifted}
 

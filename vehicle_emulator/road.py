@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from dbc.errors import UserMistake
 from dbc.section import Section, between, misfit, read_section
@@ -59,12 +59,7 @@ class FrictionPatch(Section):
         return self
 
 
-def checked_heights(points: Sequence[HeightPoint]) -> None:
-    """Refuse a profile that no road has.
-
-    Raises:
-        PydanticCustomError: one point only, stations that do not rise, or a slope beyond `STEEPEST`.
-    """
+def _checked_heights(points: list[HeightPoint]) -> list[HeightPoint]:
     if len(points) == 1:
         raise misfit("no point or at least two")
     for before, after in pairwise(points):
@@ -73,6 +68,11 @@ def checked_heights(points: Sequence[HeightPoint]) -> None:
         slope = _STEEPEST_SHARE * abs(after.height_m - before.height_m) / (after.station_m - before.station_m)
         if slope > STEEPEST:
             raise misfit(f"slopes up to {STEEPEST:g}, not {slope:.2f} between {before.station_m:g} and {after.station_m:g}")
+    return points
+
+
+Heights = Annotated[list[HeightPoint], AfterValidator(_checked_heights)]
+"""A height profile: no point or at least two, stations that rise, no slope beyond `STEEPEST`."""
 
 
 class RoadDescription(Section):
@@ -94,14 +94,8 @@ class RoadDescription(Section):
     start_station_m: Station = 0.0
     grade_percent: Percent = 0.0
     cross_fall_percent: Percent = 0.0
-    heights: list[HeightPoint] = Field(default_factory=list)
+    heights: Heights = Field(default_factory=list)
     friction: list[FrictionPatch] = Field(default_factory=list)
-
-    @field_validator("heights")
-    @classmethod
-    def _is_a_profile(cls, points: list[HeightPoint]) -> list[HeightPoint]:
-        checked_heights(points)
-        return points
 
     def to_toml(self) -> str:
         """The text of a file that `load_road` reads."""

@@ -1,6 +1,7 @@
-"""The safety driver before the robots take over: holds the speed of a rolling start, or the standing car, and steers straight ahead.
+"""The safety driver: holds the speed of a rolling start, or the standing car, and steers straight ahead until the robots take over.
 
-From the first engagement on, feet are off the pedals and hands off the wheel; what is left is the dead-man switch.
+From the first engagement on, hands are off the wheel and feet off the pedals, with the dead-man switch pressed. A car that the robots
+have handed back is braked once it is slow, and held until they are engaged again.
 """
 
 from vehicle_emulator.driver import Driver
@@ -8,13 +9,17 @@ from vehicle_emulator.plants.interface import PlantState
 
 STANDING_BRAKE_NORM = 0.3
 """Brake pedal that holds a standing car on a slope of 30 %."""
-PROPORTIONAL_PER_MPS = 0.35
-INTEGRAL_PER_M = 0.15
-"""Accelerator for each m/s, and for each metre, that the car is behind: about 1 m/s2 per m/s for the cars that come with xilgate."""
+WALKING_PACE_MPS = 2.0
+"""Below it he stops a car that was handed back; the cars that come with xilgate creep at 1.4 and 1.6 m/s on a level road."""
+PROPORTIONAL_PER_MPS = 1.0
+INTEGRAL_PER_M = 0.6
+"""Accelerator for each m/s, and for each metre, that the car is behind: the cars that come with xilgate stay within 0.3 m/s."""
 HOLDING_NM_PER_RAD = 20.0
 HOLDING_NM_PER_RADPS = 2.0
 STRONGEST_NM = 10.0
 """Hands that hold the steering wheel straight."""
+_HANDS_OFF = Driver()
+_HOLDING = Driver(brake_norm=STANDING_BRAKE_NORM)
 
 
 class SafetyDriver:
@@ -27,15 +32,18 @@ class SafetyDriver:
     def __init__(self, speed_mps: float) -> None:
         self._speed_mps = speed_mps
         self._integral_norm = 0.0
+        self._is_holding = False
 
-    def step(self, dt_s: float, state: PlantState, was_engaged: bool) -> Driver:
+    def step(self, dt_s: float, state: PlantState, *, was_engaged: bool, are_robots_active: bool) -> Driver:
         """The driver for the next `dt_s`, seeing what the car does.
 
         Args:
             was_engaged: whether the robots have ever been engaged.
+            are_robots_active: whether they are engaged or stop the car now.
         """
         if was_engaged:
-            return Driver()
+            self._is_holding = not are_robots_active and (self._is_holding or abs(state.vx_mps) < WALKING_PACE_MPS)
+            return _HOLDING if self._is_holding else _HANDS_OFF
         held_nm = -HOLDING_NM_PER_RAD * state.steering_wheel_rad - HOLDING_NM_PER_RADPS * state.steering_wheel_rate_radps
         hands_nm = min(max(held_nm, -STRONGEST_NM), STRONGEST_NM)
         if self._speed_mps <= 0.0:

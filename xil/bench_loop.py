@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from dbc.catalogue import load
 from dbc.vehicle import Vehicle, load_vehicle
 from gateway.messages import PLAN_PERIOD_NS, VehicleState
 from xil.course import blend
+from xil.figures import Row, figures_table
 from xil.lockstep import START_NS, LockstepRun
 from xil.metrics import Trace, trace
 from xil.recording import Recording
@@ -47,30 +48,6 @@ SCENARIOS = ("iso3888-1", "lane-keeping")
 _LAST_SECOND = round(1e9 / PLAN_PERIOD_NS)
 _UNLIMITED = NmpcOptions(planner=PlannerOptions(speed_margin_mps=20.0))
 """The reference speed is the path's however slow the car is, so that it asks for full throttle."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One figure beside its target.
-
-    Args:
-        target: None for a figure that is only shown.
-        relation: "at most" or "at least".
-    """
-
-    row: str
-    case: str
-    measured: float
-    unit: str
-    relation: str = ""
-    target: float | None = None
-
-    @property
-    def is_met(self) -> bool | None:
-        """Whether the target is met; None where there is none."""
-        if self.target is None:
-            return None
-        return self.measured <= self.target if self.relation == "at most" else self.measured >= self.target
 
 
 @dataclass(frozen=True)
@@ -116,22 +93,13 @@ def bench_loop(solver: str, seeds: int, progress: Callable[[str], None]) -> dict
         "machine": f"{facts['cpu']}, {facts['cores']} cores, {facts['system']}",
         "solver": solver,
         "model": DRIVE_MODEL.name,
-        "rows": [asdict(row) | {"met": row.is_met} for row in rows],
+        "rows": [row.judged() for row in rows],
     }
 
 
 def to_table(result: dict[str, Any]) -> Table:
     """The result for people."""
-    table = Table(title="Closed loop", caption=f"{result['solver']}, {result['model']}\n{result['machine']}")
-    for heading in ("", "case"):
-        table.add_column(heading)
-    for heading in ("measured", "target", "met"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in result["rows"]:
-        target = "" if row["target"] is None else f"{row['relation']} {row['target']:g}"
-        met = "" if row["met"] is None else "yes" if row["met"] else "no"
-        table.add_row(row["row"], row["case"], f"{row['measured']:.4g} {row['unit']}", target, met)
-    return table
+    return figures_table("Closed loop", f"{result['solver']}, {result['model']}\n{result['machine']}", result["rows"])
 
 
 Map = Callable[..., Iterable[Any]]

@@ -4,7 +4,6 @@ import gc
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,7 @@ from vehicle_emulator.plants.multibody.library import build
 from vehicle_emulator.plants.multibody.parameters import car_parameters
 from vehicle_emulator.plants.multibody.plant import MultibodyPlant
 from vehicle_emulator.plants.multibody.stability import largest_pole
-from xil.bench_loop import Row
+from xil.figures import Row, figures_table
 from xil.summary import machine
 
 STEP_S = STEP_NS * 1e-9
@@ -64,22 +63,13 @@ def bench_plant(vehicle_path: Path, seconds: float, progress: Callable[[str], No
         "machine": f"{facts['cpu']}, {facts['cores']} cores, {facts['system']}",
         "library": _described(library),
         "vehicle": vehicle.name,
-        "rows": [asdict(row) | {"met": row.is_met} for row in rows],
+        "rows": [row.judged() for row in rows],
     }
 
 
 def to_table(result: dict[str, Any]) -> Table:
     """The result for people."""
-    table = Table(title=f"Emulated car: {result['vehicle']}", caption=f"{result['library']}\n{result['machine']}")
-    for heading in ("", "case"):
-        table.add_column(heading)
-    for heading in ("measured", "target", "met"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    for row in result["rows"]:
-        target = "" if row["target"] is None else f"{row['relation']} {row['target']:g}"
-        met = {None: "", True: "yes", False: "no"}[row["met"]]
-        table.add_row(row["row"], row["case"], f"{row['measured']:.3g} {row['unit']}", target, met)
-    return table
+    return figures_table(f"Emulated car: {result['vehicle']}", f"{result['library']}\n{result['machine']}", result["rows"])
 
 
 def _timed(what: str, times_us: np.ndarray[Any, Any], target_us: float) -> list[Row]:

@@ -117,7 +117,7 @@ class LockstepRun:
                 self._to_car.append(frame)
 
     def _step_car(self, now_ns: int) -> None:
-        self._buses.send(self._emulator.step(now_ns, self._to_car), now_ns)
+        self._buses.send_from_car(self._emulator.step(now_ns, self._to_car), now_ns)
         self._to_car = []
         for arbitration_id, transmissions in self._emulator.disturbances:
             self._buses.disturb(arbitration_id, transmissions)
@@ -134,7 +134,7 @@ class LockstepRun:
     def _step_gateway(self, now_ns: int) -> Ending | None:
         output = self._gateway.step(now_ns, self._to_gateway, self._command, self._request)
         self._to_gateway, self._command, self._request = [], None, None
-        self._buses.send(output.frames, now_ns)
+        self._buses.send_from_gateway(output.frames, now_ns)
         if now_ns % PLAN_PERIOD_NS == 0:
             objects = nearest(report_of(self._objects), now_ns, output.state.x_m, output.state.y_m)
             answer = self._nmpc.step(output.state, now_ns, objects)

@@ -17,9 +17,9 @@ from dbc.section import Section, between, misfit, read_section
 from dbc.vehicle import Vehicle
 from gateway.telemetry import Lane, SceneSample
 from vehicle_emulator.faults.spec import Faults
-from vehicle_emulator.road import RoadDescription
+from vehicle_emulator.road import RoadDescription, Station
 from xil.course import SPACING_M, Array, Course, Outline, Pose, blend, fine_stations, integrate
-from xil.scenario_objects import Acceleration, Lateral, RoadObject, Station
+from xil.scenario_objects import Acceleration, Lateral, RoadObject
 from xil.scenario_road import Road
 
 SCENARIO_FOLDER = Path(__file__).with_name("scenarios")

@@ -9,8 +9,8 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from dbc.section import Section, between, misfit
+from vehicle_emulator.road import Station
 
-Station = Annotated[float, between(-10_000.0, 10_000.0)]
 Lateral = Annotated[float, between(-20.0, 20.0)]
 Size = Annotated[float, between(0.1, 50.0)]
 Speed = Annotated[float, between(0.0, 250.0)]

@@ -2,13 +2,12 @@
 
 from typing import Annotated
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from dbc.section import Section, between
-from vehicle_emulator.road import FrictionPatch, HeightPoint, RoadDescription, checked_heights
+from vehicle_emulator.road import FrictionPatch, Heights, Percent, RoadDescription
 
 Edge = Annotated[float, between(0.5, 100.0)]
-Percent = Annotated[float, between(-20.0, 20.0)]
 
 
 class Road(Section):
@@ -28,14 +27,8 @@ class Road(Section):
     right_m: Edge
     grade_percent: Percent = 0.0
     cross_fall_percent: Percent = 0.0
-    heights: list[HeightPoint] = Field(default_factory=list)
+    heights: Heights = Field(default_factory=list)
     friction: list[FrictionPatch] = Field(default_factory=list)
-
-    @field_validator("heights")
-    @classmethod
-    def _is_a_profile(cls, points: list[HeightPoint]) -> list[HeightPoint]:
-        checked_heights(points)
-        return points
 
     def surface(self, start_m: float) -> RoadDescription:
         """The surface under a base line that starts at a station."""

@@ -12,7 +12,7 @@ from vehicle_emulator.bus.hub import DEFAULT_RESTART_MS
 GATEWAY_NODE = "GW"
 """Name of the gateway in the DBC; everybody else on the buses is the emulator's."""
 STRANGER_NODE = ""
-"""Node of the emulator for frames that the DBC does not know, such as those of a babbling idiot; joins the robots' bus with the first."""
+"""Node of the emulator for frames of a babbling idiot, which the DBC does not know or has for the gateway's; joins a bus with the first."""
 
 
 class Arrival(NamedTuple):
@@ -38,15 +38,23 @@ class VirtualBuses:
 
     def __init__(self, catalogue: Catalogue) -> None:
         self._buses = {network: _Bus(catalogue, network) for network in NETWORKS}
-        self._route = {
-            arbitration_id: (self._buses[spec.network].core, self._buses[spec.network].nodes[spec.sender])
+        self._bus_of = {arbitration_id: self._buses[spec.network] for arbitration_id, spec in catalogue.by_id.items()}
+        self._car_route = {
+            arbitration_id: (self._bus_of[arbitration_id].core, self._bus_of[arbitration_id].nodes[spec.sender])
             for arbitration_id, spec in catalogue.by_id.items()
+            if spec.sender != GATEWAY_NODE
         }
 
-    def send(self, frames: Iterable[CanFrame], now_ns: int) -> None:
-        """Queue each frame at the node that its message belongs to; what a node refuses is lost, as on a real bus."""
+    def send_from_gateway(self, frames: Iterable[CanFrame], now_ns: int) -> None:
+        """Queue frames at the gateway's node of their bus; what a node refuses is lost, as on a real bus."""
         for arbitration_id, data, _ in frames:
-            core, node = self._route.get(arbitration_id) or self._route_of_stranger(arbitration_id)
+            bus = self._bus_of[arbitration_id]
+            bus.core.transmit(bus.nodes[GATEWAY_NODE], BusFrame(arbitration_id, data, 0, len(data)), now_ns)
+
+    def send_from_car(self, frames: Iterable[CanFrame], now_ns: int) -> None:
+        """Queue each frame at the car's node that its message belongs to, and at the stranger's where it belongs to none of them."""
+        for arbitration_id, data, _ in frames:
+            core, node = self._car_route.get(arbitration_id) or self._route_of_stranger(arbitration_id)
             core.transmit(node, BusFrame(arbitration_id, data, 0, len(data)), now_ns)
 
     def advance(self, now_ns: int) -> list[Arrival]:
@@ -61,19 +69,19 @@ class VirtualBuses:
         return arrivals
 
     def disturb(self, arbitration_id: int | None, count: int) -> None:
-        """Destroy the next transmissions of a message on the wire, which its node repeats; None: of any, on each bus."""
-        if arbitration_id is None:
-            cores = [bus.core for bus in self._buses.values()]
-        else:
-            cores = [self._route[arbitration_id][0] if arbitration_id in self._route else self._buses[ROBOTS].core]
-        for core in cores:
-            core.disturb(arbitration_id, count)
+        """Destroy the next transmissions of a message on the wire, which its node repeats; None: of any, on each bus.
+
+        See `BusCore.disturb`.
+        """
+        buses = self._buses.values() if arbitration_id is None else [self._bus_of.get(arbitration_id, self._buses[ROBOTS])]
+        for bus in buses:
+            bus.core.disturb(arbitration_id, count)
 
     def _route_of_stranger(self, arbitration_id: int) -> tuple[BusCore, int]:
-        bus = self._buses[ROBOTS]
+        bus = self._bus_of.get(arbitration_id, self._buses[ROBOTS])
         if STRANGER_NODE not in bus.nodes:
             bus.join(STRANGER_NODE)
-        self._route[arbitration_id] = route = bus.core, bus.nodes[STRANGER_NODE]
+        self._car_route[arbitration_id] = route = bus.core, bus.nodes[STRANGER_NODE]
         return route
 
     def load(self, now_ns: int) -> dict[str, float]:
@@ -89,6 +97,7 @@ class _Bus:
         self.core = BusCore(catalogue.bitrate_bps[network], restart_ms=DEFAULT_RESTART_MS)
         self.nodes: dict[str, int] = {}
         self._car: set[int] = set()
+        self._hearers: dict[tuple[tuple[int, ...], tuple[int, ...]], tuple[bool, bool]] = {}
         for name in (GATEWAY_NODE, *sorted(senders - {GATEWAY_NODE})):
             self.join(name)
 
@@ -101,7 +110,11 @@ class _Bus:
 
     def hearers(self, receivers: tuple[int, ...], senders: tuple[int, ...]) -> tuple[bool, bool]:
         """Whether gateway and car hear a frame: the car's nodes are one process, which does not hear itself."""
-        return self.nodes[GATEWAY_NODE] in receivers, not self._car.isdisjoint(receivers) and self._car.isdisjoint(senders)
+        known = self._hearers.get((receivers, senders))
+        if known is None:
+            is_for_car = not self._car.isdisjoint(receivers) and self._car.isdisjoint(senders)
+            known = self._hearers[receivers, senders] = self.nodes[GATEWAY_NODE] in receivers, is_for_car
+        return known
 
 
 def _end_ns(arrival: Arrival) -> int:

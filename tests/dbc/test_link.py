@@ -3,6 +3,7 @@
 import tempfile
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import pytest
@@ -85,7 +86,7 @@ def test_frames_arrive_in_order_and_not_at_their_sender(bus_name):
 
 def test_frames_of_one_poll_carry_its_time_and_polls_go_forward(bus_name, monkeypatch):
     clock_ns = iter(range(1000, 10**9, 1000))
-    monkeypatch.setattr("dbc.link.time.monotonic_ns", lambda: next(clock_ns))
+    monkeypatch.setattr("dbc.link.time", SimpleNamespace(monotonic_ns=lambda: next(clock_ns)))  # the bus keeps its own clock
     with CanLink(bus_name) as a, CanLink(bus_name) as b:
         a.send([CanFrame(1, b"", 0)])
         (first,) = receive(b, 1)
@@ -162,17 +163,21 @@ def test_a_refusal_that_passes_is_forgotten():
         assert (link.is_alive, link.send_errors) == (True, 1)
 
 
+def refuse_once(link, error):
+    """The bus of a link fails at the next poll."""
+    deliver, refusals = link._bus.recv, [error]
+
+    def recv(timeout):
+        if refusals:
+            raise refusals.pop()
+        return deliver(timeout)
+
+    link._bus.recv = recv
+
+
 def test_an_interface_that_went_down_and_came_back_is_alive_again():
-    refusals = [OSError(100, "Network is down")]
     with CanLink("virtual:down") as link, CanLink("virtual:down") as other:
-        deliver = link._bus.recv
-
-        def recv(timeout):
-            if refusals:
-                raise refusals.pop()
-            return deliver(timeout)
-
-        link._bus.recv = recv
+        refuse_once(link, OSError(100, "Network is down"))
         assert link.receive() == []
         assert (link.is_alive, link.receive_errors) == (False, 1)
         assert link.receive() == []
@@ -183,16 +188,8 @@ def test_an_interface_that_went_down_and_came_back_is_alive_again():
 
 
 def test_an_error_ahead_of_old_frames_hides_neither():
-    refusals = [OSError(19, "No such device")]
     with CanLink("virtual:removed") as link, CanLink("virtual:removed") as other:
-        deliver = link._bus.recv
-
-        def recv(timeout):
-            if refusals:
-                raise refusals.pop()
-            return deliver(timeout)
-
-        link._bus.recv = recv
+        refuse_once(link, OSError(19, "No such device"))
         other.send([CanFrame(1, b"", 0)])
         assert len(link.receive()) == 1
         assert (link.is_alive, link.receive_errors) == (False, 1)

@@ -22,12 +22,13 @@ def test_pedal_calibration_is_the_controllers_unit_of_force():
 @pytest.mark.parametrize(
     ("old", "new", "named"),
     [
-        ("mass_kg = { value = 1500.0", "mass_kg = { value = -3.0", "model.mass_kg"),
-        ("mass_kg = { value = 1500.0", "mass = { value = 1500.0", "model.mass"),
+        ("mass_kg = { value = 1500.0", "mass_kg = { value = -3.0", "car.toml: model.mass_kg = -3.0: Input should be greater than 0"),
+        ("mass_kg = { value = 1500.0", "mass = { value = 1500.0", "car.toml: model.mass_kg: missing"),
         ('{ value = 4.358, source = "Ford Focus Mk3 data sheet" }', "4.358", "body.length_m: a number needs its source"),
         ("value = 14.7", 'value = "14.7"', "steering.ratio = '14.7'"),
         ("[body]", "[body", "not valid TOML"),
-        ("value = 14.7", "value = nan", "steering.ratio"),
+        ("value = 14.7", "value = nan", "steering.ratio = nan: "),
+        ("[body]", "spare = \"tyre\"\n[body]", "car.toml: spare: unknown key"),
     ],
 )
 def test_mistakes_are_named(tmp_path, old, new, named):

@@ -8,7 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_emulator.actuators import Backlash, DeadTime, MotionProfile, PedalSpring, PositionSensor, Servo, quantised
+from vehicle_emulator.actuators import (
+    Backlash,
+    DeadTime,
+    MotionProfile,
+    PedalSpring,
+    PositionSensor,
+    Servo,
+    quantised,
+    second_order_transition,
+)
 
 PERIOD_S = 1e-3
 
@@ -177,3 +186,15 @@ def test_sensor_resolves_and_is_noisy_by_its_seed():
     assert mean == pytest.approx(1.234, abs=0.002)
     assert math.sqrt(sum((v - mean) ** 2 for v in values) / len(values)) == pytest.approx(0.0202, rel=0.05)
     assert all(math.remainder(v, 0.01) == pytest.approx(0.0, abs=1e-9) for v in values)
+
+
+@pytest.mark.parametrize("damping_ratio", [0.5, 1.0, 2.0])
+def test_many_small_steps_of_the_second_order_are_one_large_one(damping_ratio: float):
+    def state(steps: int) -> tuple[float, float]:
+        a, b, c, d = second_order_transition(60.0, damping_ratio, 0.05 / steps)
+        error, rate = 1.0, 3.0
+        for _ in range(steps):
+            error, rate = a * error + b * rate, c * error + d * rate
+        return error, rate
+
+    assert state(50) == pytest.approx(state(1), rel=1e-9)

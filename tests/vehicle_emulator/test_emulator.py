@@ -12,7 +12,7 @@ from dbc.e2e import E2EReceiver, E2EStatus
 from dbc.frame import CanFrame
 from dbc.vehicle import load_vehicle
 from tests.vehicle_emulator.gateway_stub import GatewayStub
-from vehicle_emulator.emulator import STEP_NS, Emulator, EmulatorSetup, StartPose
+from vehicle_emulator.emulator import STEP_NS, Emulator, EmulatorSetup, GroundTruth, StartPose
 from vehicle_emulator.faults.spec import parse_faults
 from vehicle_emulator.road import RoadDescription
 
@@ -241,3 +241,27 @@ def test_on_the_lift_the_bench_turns_and_the_virtual_car_drives():
     front, rear = truth.state.wheel_speeds_radps[:2], truth.state.wheel_speeds_radps[2:]
     assert min(front) > 1.0 > max(map(abs, rear))  # nothing drives the rear wheels in the air
     assert max(truth.state.wheel_loads_n) == 0.0
+
+
+def test_a_car_that_is_disarmed_does_not_creep_away_and_is_handed_over_to_the_robots_again():
+    car, gateway = emulator(StartPose()), GatewayStub(CATALOGUE)
+    now = 0
+
+    def ask(milliseconds: int, request: str, **commands: float) -> GroundTruth:
+        nonlocal now
+        run(car, milliseconds, lambda k: gateway.frames(request, **commands) if k % 10 == 0 else (), now)
+        now += milliseconds * STEP_NS
+        return car.truth()
+
+    for request in ("Disarm", "Arm"):
+        ask(150, request)
+    assert ask(3000, "Engage", ar_percent=30.0).state.vx_mps > 2.0
+    for request in ("Disarm", "Arm"):
+        held = ask(15_000, request).state
+        assert car.inputs.brake_norm == 0.3
+        assert abs(held.vx_mps) < 1e-3
+    again = ask(2000, "Engage", ar_percent=20.0)
+    assert again.are_robots_engaged
+    assert again.ar_position_norm == pytest.approx(0.2, abs=0.01)  # nobody has taken over
+    assert again.state.vx_mps > 1.0
+    assert car.inputs.brake_norm == 0.0

@@ -163,7 +163,10 @@ def payload(system: NavigationSystem, name: str, now_ns: int = 10 * MS_NS) -> st
 
 @pytest.mark.parametrize(("state", "message", "expected"), GOLDEN)
 def test_golden_frame(state: str, message: str, expected: str):
-    assert payload(instrument(STATES[state]), message) == expected
+    system = instrument(STATES[state])
+    for _ in range(10):
+        system.observe(STATES[state])
+    assert payload(system, message) == expected
 
 
 @pytest.mark.parametrize(
@@ -223,6 +226,18 @@ def test_distance_holds_while_the_car_creeps():
     signals = system.message("Distance", 2000 * MS_NS)
     assert signals["DistanceWithHold"] == pytest.approx(20.0, abs=0.2001)
     assert signals["Distance"] - signals["DistanceWithHold"] == pytest.approx(0.1, abs=0.002)
+
+
+def test_distance_does_not_count_a_stall_in_which_the_car_stood_still():
+    moving = PlantState(vx_mps=20.0)
+    system = instrument(moving)
+    for k in range(1, 101):
+        system.observe(moving)
+        if k % 10 == 0:
+            system.solution(k * MS_NS)
+    system.observe(moving)
+    last = system.solution(10_000 * MS_NS)
+    assert (last.distance_m, last.held_distance_m) == pytest.approx((2.02, 2.02), abs=1e-6)
 
 
 def test_date_and_milliseconds_at_the_turn_of_a_year():

@@ -245,6 +245,24 @@ def test_silence_ends_with_the_next_cycle_of_the_grid():
     assert [k for k in range(96, 121) if drive.system.due(k * MS_NS)] == [100, 110, 120]
 
 
+def test_a_silent_instrument_goes_on_losing_and_finding_its_fix():
+    drive = Drive()
+
+    def silent(duration_s: float, mode: str | None) -> None:
+        drive.system.faults = InsFaults(is_silent=True, gnss_mode=mode)
+        for _ in range(round(100 * duration_s)):
+            drive.now_ns += CYCLE_NS
+            assert drive.system.due(drive.now_ns) == ()
+
+    silent(20.0, "None")
+    drive.run(0.01)
+    assert drive.mode == "Search"
+    assert drive.accuracy_m > 5.0 * Drive().received("NcomStatus03")["PosAccNorth"]
+    silent(14.0, None)
+    drive.run(0.01)
+    assert drive.mode == "RTKInteger"
+
+
 @pytest.mark.parametrize(("extra_s", "steps"), [(0.0, 4), (0.0001, 4), (0.0006, 5), (0.01, 14), (1.0, 1004)])
 def test_extra_latency_is_exact_to_the_step_in_data_and_time(extra_s: float, steps: int):
     system = NavigationSystem(QUIET, CATALOGUE, Random(1), period_ns=MS_NS, start_ns=0, state=PlantState())

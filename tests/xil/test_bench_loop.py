@@ -20,7 +20,6 @@ from xil.bench_loop import (
     DRIVEN,
     UNOBSERVED,
     FullDrive,
-    Row,
     distances_m,
     full_drive,
     loss,
@@ -28,12 +27,13 @@ from xil.bench_loop import (
     with_dead_time,
     with_mass,
 )
+from xil.figures import Row
 from xil.lockstep import START_NS, LockstepRun
 from xil.recording import Recording
 from xil.scenario import Scenario, Stage, load_scenario
 from xil.setup import RunSetup
 
-SOLVER = "casadi-c"
+SOLVER = "riccati"
 VEHICLE = load_vehicle()
 
 

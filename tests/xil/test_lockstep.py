@@ -103,8 +103,28 @@ def test_the_run_tells_how_fast_it_was(sil):
     assert summary["realtime_factor"] == pytest.approx(float(line[1]) / float(line[2]), rel=0.05)
 
 
+SHORT = """
+name = "short"
+description = "One bend at 50 km/h from beside the lane's centre, then to rest: short, because the uncompiled controller is slow"
+time_limit_s = 12.0
+start = { offset_m = -0.3, speed_kmh = 50.0 }
+speed = { cruise_kmh = 50.0, acceleration_mps2 = 1.5, deceleration_mps2 = 4.0, stop_m = 70.0 }
+path = { start_m = 0.0, curves = [{ start_m = 20.0, end_m = 60.0, radius_m = 150.0, transition_m = 15.0 }] }
+road = { left_m = 1.75, right_m = 1.75 }
+
+[judge]
+from_m = 30.0
+to_m = 45.0
+entry_speed_error_kmh = 3.0
+lateral_error_max_m = 0.25
+heading_error_max_deg = 3.0
+"""
+
+
 def test_mil_passes_with_the_uncompiled_controller(tmp_path):
-    finished, summary = drive(tmp_path, "--stage", "mil")
+    path, out = tmp_path / "short.toml", tmp_path / "run"
+    path.write_text(SHORT)
+    finished, summary = drive(out, str(path), "--stage", "mil")
     assert finished.returncode == 0, summary["reason"]
     assert summary["solver"] == "casadi-vm"
     assert summary["compiler"] == ""

@@ -61,6 +61,10 @@ def drive(tmp_path):
     running.close()
 
 
+def is_engaged(state):
+    return state.mode == "ENGAGED"
+
+
 def in_manoeuvre(state):
     return state.mode == "ENGAGED" and state.x_m > 20.0
 
@@ -110,7 +114,7 @@ def test_a_killed_controller_stops_the_car_and_is_named(drive):
 
 @pytest.mark.parametrize("victim", ["gateway", "emulator", "bus"])
 def test_whoever_is_killed_ends_the_run_and_is_named(drive, victim):
-    drive.wait_for(in_manoeuvre, "the manoeuvre")
+    drive.wait_for(is_engaged, "the engagement")
     os.kill(drive.children[victim], signal.SIGKILL)
     output, _ = drive.process.communicate(timeout=60)
     assert drive.process.returncode == 1, output
@@ -126,7 +130,7 @@ def test_a_bus_that_dies_alone_stops_the_car_and_is_named(tmp_path, victim):
     buses = ["--bus", f"xilgate:{channels['robots']}", "--navigation-bus", f"xilgate:{channels['navigation']}"]
     drive = Drive(tmp_path, buses=buses)
     try:
-        drive.wait_for(in_manoeuvre, "the manoeuvre")
+        drive.wait_for(is_engaged, "the engagement")
         assert drive.children.keys() == EVERYONE - {"bus"}
         assert drive.status.dead_buses == []
         hubs[victim].kill()
@@ -145,7 +149,7 @@ def test_a_bus_that_dies_alone_stops_the_car_and_is_named(tmp_path, victim):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_no_process_survives_its_runner(drive, number):
-    drive.wait_for(lambda state: state.mode == "ENGAGED", "the engagement")
+    drive.wait_for(is_engaged, "the engagement")
     assert drive.children.keys() == EVERYONE
     drive.process.send_signal(number)
     drive.process.communicate(timeout=20)
@@ -158,7 +162,7 @@ def test_a_run_tells_the_controller_of_its_objects_and_keeps_what_was_tuned(tmp_
     samples = {"objects": [], "command": []}
     try:
         with Subscriber(lambda topic, payload: samples[topic].append(decode(topic, payload)), list(samples), drive.port):
-            drive.wait_for(lambda state: state.mode == "ENGAGED", "the engagement")
+            drive.wait_for(is_engaged, "the engagement")
             request(SetRequest(changes={"planner.safe_time_s": 1.3}, who="a test"), drive.port)
             drive.wait_for(lambda state: samples["command"][-1].objects == 1, "the object in the controller")
             drive.wait_for(lambda state: samples["command"][-1].parameters_version == 1, "the parameter in force")

@@ -1,5 +1,7 @@
 """Gateway and car on two buses in virtual time: who hears what, when, and in which order."""
 
+from collections.abc import Iterable
+
 import pytest
 
 from dbc.catalogue import load
@@ -23,6 +25,14 @@ def duration_ns(sent: CanFrame) -> int:
     return bits * BIT_NS
 
 
+def send(buses: VirtualBuses, frames: Iterable[CanFrame], now_ns: int) -> None:
+    """Every frame from whom the DBC has it."""
+    for each in frames:
+        spec = CATALOGUE.by_id.get(each.arbitration_id)
+        one = buses.send_from_gateway if spec is not None and spec.sender == "GW" else buses.send_from_car
+        one([each], now_ns)
+
+
 @pytest.fixture
 def buses():
     buses = VirtualBuses(CATALOGUE)
@@ -32,7 +42,7 @@ def buses():
 
 def test_a_frame_arrives_when_its_last_bit_has(buses):
     sent = frame("SR_Command", b"\x01\x02\x03\x04\x05\x06\x07\x08")
-    buses.send([sent], START_NS)
+    send(buses, [sent], START_NS)
     end_ns = START_NS + duration_ns(sent)
     assert buses.advance(end_ns - 1) == []
     (arrival,) = buses.advance(end_ns)
@@ -42,7 +52,7 @@ def test_a_frame_arrives_when_its_last_bit_has(buses):
 
 def test_the_car_hears_the_gateway_alone_and_the_gateway_everybody(buses):
     names = ("SR_Command", "SR_Status", "RC_SafetyStatus", "PosLocal")
-    buses.send(map(frame, names), START_NS)
+    send(buses, map(frame, names), START_NS)
     heard = {CATALOGUE.by_id[a.frame.arbitration_id].name: a for a in buses.advance(START_NS + 5 * MS_NS)}
     assert {name for name, a in heard.items() if a.is_for_car} == {"SR_Command"}
     assert {name for name, a in heard.items() if a.is_for_gateway} == {"SR_Status", "RC_SafetyStatus", "PosLocal"}
@@ -51,7 +61,7 @@ def test_the_car_hears_the_gateway_alone_and_the_gateway_everybody(buses):
 
 def test_frames_of_one_moment_go_by_priority_on_each_bus_and_the_buses_side_by_side(buses):
     names = ["MilliTime", "BR_Status", "SR_Command", "PosLocal", "RC_SafetyStatus", "GW_SafetyCommand", "SR_Status"]
-    buses.send(map(frame, names), START_NS)
+    send(buses, map(frame, names), START_NS)
     arrivals = buses.advance(START_NS + 10 * MS_NS)
     assert [a.frame.t_ns for a in arrivals] == sorted(a.frame.t_ns for a in arrivals)
     for network, expected in {
@@ -69,25 +79,45 @@ def test_frames_of_one_moment_go_by_priority_on_each_bus_and_the_buses_side_by_s
 
 def test_a_command_waits_for_the_frame_on_the_wire_and_no_longer(buses):
     slow, urgent = frame("GW_Heartbeat"), frame("SR_Command")
-    buses.send([slow, frame("BR_Status")], START_NS)
+    send(buses, [slow, frame("BR_Status")], START_NS)
     first_ns = START_NS + duration_ns(frame("BR_Status"))
     buses.advance(START_NS + 10 * BIT_NS)
-    buses.send([urgent], START_NS + 10 * BIT_NS)
+    send(buses, [urgent], START_NS + 10 * BIT_NS)
     order = [CATALOGUE.by_id[a.frame.arbitration_id].name for a in buses.advance(START_NS + 5 * MS_NS)]
     assert order == ["BR_Status", "SR_Command", "GW_Heartbeat"]
     assert first_ns > START_NS + 10 * BIT_NS
 
 
 def test_a_stranger_is_heard_by_the_gateway_on_the_robots_bus(buses):
-    buses.send([CanFrame(1, b"\xff", 0)], START_NS)
+    send(buses, [CanFrame(1, b"\xff", 0)], START_NS)
     (arrival,) = buses.advance(START_NS + MS_NS)
     assert (arrival.network, arrival.frame.arbitration_id, arrival.is_for_gateway, arrival.is_for_car) == ("robots", 1, True, False)
+
+
+def test_what_the_car_sends_under_an_identifier_of_the_gateway_is_not_sent_by_the_gateway(buses):
+    forged, genuine = frame("SR_Command", b"\x01" * 8), frame("SR_Command", b"\x02" * 8)
+    buses.send_from_car([forged], START_NS)
+    (arrival,) = buses.advance(START_NS + MS_NS)
+    assert (arrival.frame.data, arrival.is_for_gateway, arrival.is_for_car) == (forged.data, True, False)
+    buses.send_from_gateway([genuine], START_NS + MS_NS)
+    (arrival,) = buses.advance(START_NS + 2 * MS_NS)
+    assert (arrival.frame.data, arrival.is_for_gateway, arrival.is_for_car) == (genuine.data, False, True)
+
+
+def test_a_disturbance_can_be_taken_back(buses):
+    sent = [frame("SR_Command"), frame("PosLocal")]
+    for arbitration_id in (None, sent[0].arbitration_id):
+        buses.disturb(arbitration_id, 20)
+        buses.disturb(arbitration_id, 0)
+    send(buses, sent, START_NS)
+    ends_ns = {a.network: a.frame.t_ns - START_NS for a in buses.advance(START_NS + 5 * MS_NS)}
+    assert ends_ns == {"robots": duration_ns(sent[0]), "navigation": duration_ns(sent[1])}
 
 
 def test_a_disturbed_frame_is_repeated_and_comes_later(buses):
     sent = frame("SR_Command")
     buses.disturb(sent.arbitration_id, 2)
-    buses.send([sent, frame("PosLocal")], START_NS)
+    send(buses, [sent, frame("PosLocal")], START_NS)
     arrivals = {a.network: a.frame for a in buses.advance(START_NS + 5 * MS_NS)}
     assert arrivals["navigation"].t_ns == START_NS + duration_ns(frame("PosLocal"))
     assert arrivals["robots"].t_ns > START_NS + 3 * duration_ns(sent)
@@ -96,7 +126,7 @@ def test_a_disturbed_frame_is_repeated_and_comes_later(buses):
 def test_any_frame_of_either_bus_can_be_disturbed(buses):
     buses.disturb(None, 1)
     sent = [frame("SR_Command"), frame("PosLocal")]
-    buses.send(sent, START_NS)
+    send(buses, sent, START_NS)
     arrivals = buses.advance(START_NS + 5 * MS_NS)
     assert {a.network for a in arrivals} == {"robots", "navigation"}
     assert all(a.frame.t_ns > START_NS + 2 * min(map(duration_ns, sent)) for a in arrivals)
@@ -104,7 +134,7 @@ def test_any_frame_of_either_bus_can_be_disturbed(buses):
 
 def test_load_is_the_share_of_busy_bits(buses):
     sent = [frame("SR_Command"), frame("PosLocal"), frame("MilliTime")]
-    buses.send(sent, START_NS)
+    send(buses, sent, START_NS)
     buses.advance(START_NS + 5 * MS_NS)
     loads = buses.load(START_NS + 10 * MS_NS)
     busy_ns = [duration_ns(each) + 3 * BIT_NS for each in sent]
@@ -115,6 +145,6 @@ def test_the_bit_rate_is_that_of_the_dbc():
     faster = load()
     faster.bitrate_bps["navigation"] = 1_000_000
     buses = VirtualBuses(faster)
-    buses.send([frame("PosLocal"), frame("SR_Status")], START_NS)
+    send(buses, [frame("PosLocal"), frame("SR_Status")], START_NS)
     ends = {a.network: a.frame.t_ns - START_NS for a in buses.advance(START_NS + MS_NS)}
     assert ends == {"robots": duration_ns(frame("SR_Status")), "navigation": duration_ns(frame("PosLocal")) // 2}

@@ -196,19 +196,20 @@ def test_the_map_shows_the_object_where_the_car_was_closest():
     assert clearance.value < 0.0
 
 
-@pytest.mark.parametrize("name", ["pedestrian", "pedestrian-stays", "cut-in-lane-change"])
-def test_the_car_waits_for_who_crosses_stands_before_who_stays_and_follows_who_cuts_in(tmp_path, name):
+WAITS_M, DRIVES_ROUND_M = (1.5, 15.0), (0.4, 1.5)
+"""Clearance to who crosses, stays or cuts in, and to what is passed."""
+
+
+@pytest.mark.parametrize(
+    ("name", "between_m"),
+    [
+        ("pedestrian", WAITS_M), ("pedestrian-stays", WAITS_M), ("cut-in-lane-change", WAITS_M),
+        ("parking", DRIVES_ROUND_M), ("cut-in", DRIVES_ROUND_M),
+    ],
+)  # fmt: skip
+def test_the_car_waits_for_who_crosses_stays_or_cuts_in_and_drives_round_what_it_may_pass(tmp_path, name, between_m):
     finished = xilgate("drive", name, "--stage", "sil", "--solver", "riccati", "--out", str(tmp_path / "run"))
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert finished.returncode == 0, summary["reason"]
     (clearance,) = [m["value"] for m in summary["metrics"] if m["name"].startswith("clearance to")]
-    assert 1.5 < clearance < 15.0
-
-
-@pytest.mark.parametrize("name", ["parking", "cut-in"])
-def test_the_car_drives_round_what_appears(tmp_path, name):
-    finished = xilgate("drive", name, "--stage", "sil", "--solver", "riccati", "--out", str(tmp_path / "run"))
-    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert finished.returncode == 0, summary["reason"]
-    (clearance,) = [m["value"] for m in summary["metrics"] if m["name"].startswith("clearance to")]
-    assert 0.4 < clearance < 1.5
+    assert between_m[0] < clearance < between_m[1]

@@ -177,15 +177,17 @@ class BusCore:
         return min(times_ns, default=None)
 
     def disturb(self, arbitration_id: int | None, count: int) -> None:
-        """Destroy the next attempts to send a frame by a bit error; calls for one identifier add up.
+        """Destroy the next attempts to send a frame by a bit error; a call takes the place of an earlier one for the same identifier.
 
         Args:
             arbitration_id: of the frames to destroy; None for any.
-            count: attempts, retransmissions included.
+            count: attempts, retransmissions included; 0 takes back what is left.
         """
-        if count < 1:
-            raise ValueError(f"count {count} of a disturbance: expected 1 or more")
-        self._disturbances[arbitration_id] = self._disturbances.get(arbitration_id, 0) + count
+        if count < 0:
+            raise ValueError(f"count {count} of a disturbance: expected 0 or more")
+        self._disturbances.pop(arbitration_id, None)
+        if count:
+            self._disturbances[arbitration_id] = count
         self._plan = None
 
     def restart(self, node: int, now_ns: int) -> bool:
@@ -227,6 +229,8 @@ class BusCore:
         """All that ends by a time, and all that begins before it: at that very time somebody else may still join arbitration."""
         if self._origin_ns is None:
             self._origin_ns = self._now_ns = self._idle_ns = until_ns
+        elif until_ns == self._now_ns:
+            return
         if until_ns < self._now_ns:
             raise ValueError(f"time goes back from {self._now_ns} to {until_ns} ns")
         while True:

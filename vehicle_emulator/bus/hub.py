@@ -266,7 +266,7 @@ class Hub:
                 self.core.set_restart(peer.node, restart_ms or None)
             case Restart() if peer.node is not None:
                 self.core.restart(peer.node, max(now_ns, self.core.now_ns))
-            case Disturb(arbitration_id, count) if peer.node is not None and self.core.disturbed_ids < _MAX_DISTURBED_IDS:
+            case Disturb(arbitration_id, count) if peer.node is not None and (not count or self.core.disturbed_ids < _MAX_DISTURBED_IDS):
                 self.core.disturb(arbitration_id, count)
             case _:
                 self._refuse(peer, 1)

@@ -92,11 +92,11 @@ class XilgateBus(can.BusABC):
         self._transfer(wire.pack_control(wire.Restart()), 0.0)
 
     def disturb(self, arbitration_id: int | None, count: int) -> None:
-        """Destroy the next attempts to send a frame on the wire by a bit error, whoever sends it.
+        """Destroy the next attempts to send a frame on the wire by a bit error, whoever sends it; see `BusCore.disturb`.
 
         Args:
             arbitration_id: of the frames to destroy; None for any.
-            count: attempts, retransmissions included, 1 to 1,000,000; 32 in a row take a sender to bus-off.
+            count: attempts, retransmissions included, 0 (take back) to 1,000,000; 32 in a row take a sender to bus-off.
 
         Raises:
             can.CanOperationError: the hub has gone, or takes no more.

@@ -7,7 +7,7 @@ import msgspec
 
 from vehicle_emulator.bus.frame import BITRATE_SWITCH, ERROR, ERROR_STATE_INDICATOR, EXTENDED, FD, REMOTE, BusFrame
 
-VERSION = 2
+VERSION = 3
 """Of the packets; hub and node refuse each other when theirs differ."""
 MAX_PACKET_BYTES = 4096
 MAX_FILTERS = 64
@@ -85,11 +85,11 @@ class Disturb(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True)
 
     Args:
         arbitration_id: of the frames; None for any.
-        count: attempts.
+        count: attempts; 0 takes back what is left.
     """
 
     arbitration_id: Identifier | None
-    count: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)]
+    count: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)]
 
 
 Control = Hello | Settings | Restart | Disturb

@@ -22,7 +22,7 @@ class Disturbance(NamedTuple):
 
     Args:
         arbitration_id: of the frames; None for any frame on any bus.
-        transmissions: how many.
+        transmissions: how many, in the place of those that are left; 0 takes them back.
     """
 
     arbitration_id: int | None

@@ -15,12 +15,14 @@ from typing import NamedTuple
 from dbc.catalogue import Catalogue
 from dbc.frame import CanFrame
 from vehicle_emulator.faults.condition import Situation
-from vehicle_emulator.faults.effects import NOTHING, ActiveFaults
+from vehicle_emulator.faults.effects import NOTHING, ActiveFaults, Disturbance
 from vehicle_emulator.faults.instance import Direction, Fault, FrameFault, make_fault
 from vehicle_emulator.faults.schedule import NEVER_NS
 from vehicle_emulator.faults.spec import MAX_FAULTS, FaultMistake, FaultSpec, named
 
 BEGINS, ENDS, CLEARED = "begins", "ends", "cleared"
+MAX_BEGINNINGS_NOTED = 100
+"""Of one fault: a condition that comes and goes makes up to 1,000 events a second."""
 
 
 class FaultEvent(NamedTuple):
@@ -28,7 +30,8 @@ class FaultEvent(NamedTuple):
 
     Args:
         what: the fault as people type it.
-        event: `BEGINS`, `ENDS` or `CLEARED`.
+        event: `BEGINS`, `ENDS` or `CLEARED`. After `MAX_BEGINNINGS_NOTED` beginnings and their ends one more beginning is noted,
+            and from then on only that it is cleared or ends for good.
         hits: frames that it has hit so far.
     """
 
@@ -58,6 +61,7 @@ class FaultEngine:
         self._on_frames: list[FrameFault] = []
         self._events: list[FaultEvent] = []
         self._active = NOTHING
+        self._undisturbed: list[int | None] = []
         self._wake_ns = NEVER_NS
         self.add(start_ns, specs)
 
@@ -105,6 +109,7 @@ class FaultEngine:
         for fault in cleared:
             if fault.schedule.is_active:
                 self._note(now_ns, fault, CLEARED)
+                self._undisturbed += fault.disturbed
             fault.schedule.end()
         self._faults = [fault for fault in self._faults if fault not in cleared]
         self._wake_ns = 0
@@ -145,14 +150,27 @@ class FaultEngine:
             fault.update(now_ns, situation)
             if fault.schedule.is_active is not was_active:
                 self._note(now_ns, fault, ENDS if was_active else BEGINS)
+                self._undisturbed += fault.disturbed if was_active else ()
             if fault.schedule.is_active:
                 active = fault.apply(active, now_ns)
             wake_ns = min(wake_ns, fault.wake_ns)
         self._of_frames = [fault for fault in self._of_frames if fault.is_holding or not fault.schedule.is_over]
         self._on_frames = [fault for fault in self._of_frames if fault.is_in_use]
+        if self._undisturbed:
+            active = self._take_back(active)
         self._active = active
         # What is destroyed on the wire is asked for in one step only.
         self._wake_ns = now_ns if active.disturbances else wake_ns
 
+    def _take_back(self, active: ActiveFaults) -> ActiveFaults:
+        """Nothing of a fault that is over is left on the wire, unless another one is about the same frames."""
+        disturbed = {identifier for fault in self._faults if fault.schedule.is_active for identifier in fault.disturbed}
+        free = [identifier for identifier in dict.fromkeys(self._undisturbed) if identifier not in disturbed]
+        self._undisturbed = []
+        return active._replace(disturbances=(*(Disturbance(identifier, 0) for identifier in free), *active.disturbances))
+
     def _note(self, now_ns: int, fault: Fault, event: str) -> None:
+        is_untold = fault.begun > MAX_BEGINNINGS_NOTED + (event == BEGINS)
+        if is_untold and event != CLEARED and not fault.schedule.is_over:
+            return
         self._events.append(FaultEvent(now_ns, fault.spec.name, fault.spec.text, event, fault.hits))

@@ -5,22 +5,22 @@ lets go in `release`. The frames of each direction have an effect of their own. 
 another node has made, has neither counter nor CRC and goes on as it is where these are wanted.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
+from heapq import heappop, heappush
+from itertools import count
 from random import Random
 
-from e2e.p02 import e2e_p02_protect
-
 from dbc.catalogue import MessageSpec
-from dbc.e2e import COUNTER_MODULUS, COUNTER_START_BIT, data_id_list
+from dbc.e2e import CRC_BYTE, alive_counter, seal
 from dbc.frame import CanFrame
 from vehicle_emulator.faults.spec import FaultSpec
 
 _NS_PER_MS = 1_000_000
 _NS_PER_S = 1_000_000_000
-_COUNTER_BYTE = COUNTER_START_BIT // 8
-_COUNTER_MASK = COUNTER_MODULUS - 1
-_CRC_BYTE = 0
+_STEP_NS = 1_000_000
+"""Of the emulator, which calls once in each."""
 
 Messages = Mapping[int, MessageSpec]
 """Messages by their arbitration ids."""
@@ -77,6 +77,10 @@ class Effect:
         """What goes on in the place of a frame that is hit."""
         return [frame]
 
+    def skip(self, now_ns: int, frame: CanFrame) -> list[CanFrame]:
+        """What goes on in the place of a frame of its messages that is not hit."""
+        return [frame]
+
     def release(self, now_ns: int, is_active: bool) -> list[CanFrame]:
         """What it lets go now."""
         return []
@@ -111,30 +115,46 @@ class Copies(Effect):
 
 
 class Hold(Effect):
-    """Frames come late, each by a time of its own; those of one message stay in order."""
+    """Frames come late, each by a time of its own; those of one message that are hit stay in order."""
 
     def __init__(self, delay_ns: Callable[[], int]) -> None:
         self._delay_ns = delay_ns
-        self._kept: list[tuple[int, CanFrame]] = []
+        self._kept: list[tuple[int, int, CanFrame]] = []
+        self._places = count()
         self._last_due_ns: dict[int, int] = {}
 
     def take(self, now_ns: int, frame: CanFrame) -> list[CanFrame]:
         """See `Effect`."""
-        due_ns = max(now_ns + self._delay_ns(), self._last_due_ns.get(frame.arbitration_id, 0))
-        self._last_due_ns[frame.arbitration_id] = due_ns
-        self._kept.append((due_ns, frame))
+        self._keep(max(now_ns + self._delay_ns(), self._last_due_ns.get(frame.arbitration_id, 0)), frame)
         return []
 
     def release(self, now_ns: int, is_active: bool) -> list[CanFrame]:
         """See `Effect`."""
-        due = sorted((entry for entry in self._kept if entry[0] <= now_ns), key=lambda entry: entry[0])
-        self._kept = [entry for entry in self._kept if entry[0] > now_ns]
-        return [frame._replace(t_ns=now_ns) for _, frame in due]
+        due: list[CanFrame] = []
+        while self._kept and self._kept[0][0] <= now_ns:
+            due.append(heappop(self._kept)[2]._replace(t_ns=now_ns))
+        return due
 
     @property
     def is_holding(self) -> bool:
         """See `Effect`."""
         return bool(self._kept)
+
+    def _keep(self, due_ns: int, frame: CanFrame) -> None:
+        self._last_due_ns[frame.arbitration_id] = due_ns
+        heappush(self._kept, (due_ns, next(self._places), frame))
+
+
+class HoldInOrder(Hold):
+    """The same, and no frame of a message overtakes one of it that is held, hit or not."""
+
+    def skip(self, now_ns: int, frame: CanFrame) -> list[CanFrame]:
+        """See `Effect`."""
+        due_ns = self._last_due_ns.get(frame.arbitration_id, 0)
+        if due_ns <= now_ns:
+            return [frame]
+        self._keep(due_ns, frame)
+        return []
 
 
 class Reorder(Effect):
@@ -188,11 +208,12 @@ class Replay(Effect):
 
 
 class Babble(Effect):
-    """Frames of nobody, at a rate."""
+    """Frames of nobody, at a rate; after a pause of the emulator, those that were due meanwhile are left out."""
 
     def __init__(self, frame: CanFrame, rate_hz: float) -> None:
         self._frame = frame
         self._rate_hz = rate_hz
+        self._most = math.ceil(rate_hz * _STEP_NS / _NS_PER_S)
         self._since_ns = 0
         self._sent = 0
 
@@ -204,7 +225,7 @@ class Babble(Effect):
         """See `Effect`."""
         due = 1 + int((now_ns - self._since_ns) * self._rate_hz / _NS_PER_S)
         new, self._sent = due - self._sent, due
-        return [self._frame._replace(t_ns=now_ns)] * new
+        return [self._frame._replace(t_ns=now_ns)] * min(new, self._most)
 
 
 class Stuck(Effect):
@@ -253,34 +274,31 @@ def _cut(spec: FaultSpec, _: Messages, __: Random) -> Effect:
 
 def _bad_crc(_: FaultSpec, __: Messages, ___: Random) -> Effect:
     def change(frame: CanFrame) -> CanFrame:
-        return frame._replace(data=bytes(byte ^ 0xFF if place == _CRC_BYTE else byte for place, byte in enumerate(frame.data)))
+        return frame._replace(data=bytes(byte ^ 0xFF if place == CRC_BYTE else byte for place, byte in enumerate(frame.data)))
 
     return Change(change)
 
 
 def _bad_counter(_: FaultSpec, messages: Messages, __: Random) -> Effect:
-    return Stuck(messages, lambda message, first, live: _sealed(message, live, first[_COUNTER_BYTE]))
+    return Stuck(messages, lambda message, first, live: _sealed(message, live, first))
 
 
 def _freeze(_: FaultSpec, messages: Messages, __: Random) -> Effect:
     def mix(message: MessageSpec, first: bytes, live: bytes) -> bytes:
-        return first if message.e2e_data_id is None else _sealed(message, first, live[_COUNTER_BYTE])
+        return first if message.e2e_data_id is None else _sealed(message, first, live)
 
     return Stuck(messages, mix)
 
 
-def _sealed(message: MessageSpec, payload: bytes, counter: int) -> bytes:
-    """The payload with a counter and the CRC that fits."""
+def _sealed(message: MessageSpec, payload: bytes, counted: bytes) -> bytes:
+    """The payload with the counter of another one and the CRC that fits."""
     assert message.e2e_data_id is not None
-    buffer = bytearray(payload)
-    buffer[_COUNTER_BYTE] = (buffer[_COUNTER_BYTE] & ~_COUNTER_MASK) | (counter & _COUNTER_MASK)
-    e2e_p02_protect(buffer, data_id_list(message.e2e_data_id), increment_counter=False)
-    return bytes(buffer)
+    return seal(payload, message.e2e_data_id, alive_counter(counted))
 
 
 def _jitter(spec: FaultSpec, _: Messages, random: Random) -> Effect:
     longest_ns = spec.number("jitter_ms") * _NS_PER_MS
-    return Hold(lambda: round(random.uniform(0.0, longest_ns)))
+    return HoldInOrder(lambda: round(random.uniform(0.0, longest_ns)))
 
 
 def _delay(spec: FaultSpec, _: Messages, __: Random) -> Effect:

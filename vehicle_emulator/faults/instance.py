@@ -15,8 +15,8 @@ from vehicle_emulator.faults.schedule import NEVER_NS, Schedule
 from vehicle_emulator.faults.spec import FaultSpec
 from vehicle_emulator.faults.targets import Target, target_of
 
-_BUS_OFF_ERRORS = 32
-"""Transmit error counter 256 at 8 for each error, ISO 11898-1."""
+_BUS_OFF_ERRORS = 48
+"""Transmit error counter 256 at 8 for each error (ISO 11898-1), and half as many again: each other frame of the controller takes 1 off."""
 _NS_PER_MS = 1_000_000
 
 
@@ -33,12 +33,19 @@ class Fault:
     Attributes:
         spec: what was asked for.
         schedule: when it is active.
+        begun: how often it has begun.
         hits: frames that it has hit.
     """
 
     def __init__(self, spec: FaultSpec, base_ns: int) -> None:
         self.spec = spec
         self.schedule = Schedule(spec, base_ns)
+        self.begun = 0
+
+    @property
+    def disturbed(self) -> Sequence[int | None]:
+        """Identifiers whose transmissions it destroys; None for any."""
+        return ()
 
     @property
     def hits(self) -> int:
@@ -60,6 +67,7 @@ class Fault:
         was_active = self.schedule.is_active
         self.schedule.update(now_ns, situation)
         if self.schedule.is_active and not was_active:
+            self.begun += 1
             self.begin(now_ns)
 
     def begin(self, now_ns: int) -> None:
@@ -122,7 +130,7 @@ class FrameFault(Fault):
                 passed.append(frame)
                 continue
             effect.see(now_ns, frame)
-            passed += effect.take(now_ns, frame) if is_active and self.picker.picks() else [frame]
+            passed += effect.take(now_ns, frame) if is_active and self.picker.picks() else effect.skip(now_ns, frame)
         return passed
 
 
@@ -157,6 +165,11 @@ class WireFault(Fault):
         self._period_ns = round(spec.number("period_ms") * _NS_PER_MS) if "period_ms" in spec.values else NEVER_NS
         self._disturbances = _disturbances(spec, target)
         self._next_ns = NEVER_NS
+
+    @property
+    def disturbed(self) -> Sequence[int | None]:
+        """See `Fault`."""
+        return [disturbance.arbitration_id for disturbance in self._disturbances]
 
     @property
     def wake_ns(self) -> int:

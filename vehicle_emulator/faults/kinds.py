@@ -167,7 +167,10 @@ _KINDS = (
     _frames("freeze_payload", "the payload stays as it was at the first hit, with live counter and CRC"),
     _frames("replay", "the frame of an earlier time, byte by byte", _frame_time("age_ms", "how much earlier")),
     _frames("delay", "the frame comes late", _frame_time("delay_ms", "by how much")),
-    _frames("jitter", "the frame comes late by a random time, in order with its message", _frame_time("jitter_ms", "at most by how much")),
+    _frames(
+        "jitter", "the frame comes late by a random time, in order with its message, frames that are not hit included",
+        _frame_time("jitter_ms", "at most by how much"),
+    ),
     _frames("duplicate", "the frame comes several times", _whole("copies", 1, 100, "how many more", 1)),
     _frames("reorder", "frames are collected and come in reverse order", _whole("depth", 2, 64, "how many", 2)),
     Kind("silence", Group.FRAMES, "a node is not heard: all that it sends is lost", (Parameter("node", Word(), "a node of the DBC"),)),
@@ -184,7 +187,7 @@ _KINDS = (
         (_MESSAGES, _whole("errors", 1, 1_000, "transmissions of each message that are destroyed", 1), _PERIOD),
     ),
     Kind(
-        "bus_off", Group.WIRE, "32 transmissions of a node are destroyed, which drives its controller bus-off; emulated bus only",
+        "bus_off", Group.WIRE, "transmissions of a node are destroyed until its controller is bus-off; emulated bus only",
         (Parameter("node", Word(), "a node of the DBC; one controller may serve several"), _PERIOD),
     ),
     Kind("robot_stuck", Group.ROBOTS, "the robot stays where it is, whatever is commanded", (_ROBOT,)),

@@ -23,12 +23,15 @@ class GaussMarkov:
         self._random = random
         self._sigma = sigma
         self._correlation_s = correlation_s
+        self._dt_s, self._kept, self._renewed = 0.0, 1.0, 0.0
         self.value = random.gauss(0.0, sigma)
 
     def step(self, dt_s: float) -> float:
         """The error after `dt_s`."""
-        kept = math.exp(-dt_s / self._correlation_s)
-        self.value = kept * self.value + self._sigma * math.sqrt(1.0 - kept * kept) * self._random.gauss(0.0, 1.0)
+        if dt_s != self._dt_s:
+            self._dt_s, self._kept = dt_s, math.exp(-dt_s / self._correlation_s)
+            self._renewed = math.sqrt(1.0 - self._kept * self._kept)
+        self.value = self._kept * self.value + self._sigma * self._renewed * self._random.gauss(0.0, 1.0)
         return self.value
 
     def correct(self, sigma: float) -> None:

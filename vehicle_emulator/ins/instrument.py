@@ -114,6 +114,7 @@ class NavigationSystem:
         self._solution: Solution | None = None
         self._felt: Motion | None = None
         self._distance_m = self._held_distance_m = 0.0
+        self._unsolved_periods = 0
         self._transmitted = 0
 
     @property
@@ -136,14 +137,18 @@ class NavigationSystem:
     def observe(self, state: PlantState) -> None:
         """Take the true motion of one more period."""
         self._history.append(state)
+        self._unsolved_periods += 1
 
     def due(self, now_ns: int) -> tuple[str, ...]:
         """Names of the messages to send now, in the order of their identifiers.
 
         A message of the DBC comes every `GenMsgCycleTime` / 10 ms cycles of the instrument, and of the status channels one per
-        cycle, in turn. Cycles that a stall of the caller has swallowed are skipped, not sent in a burst.
+        cycle, in turn. Cycles that a stall of the caller has swallowed are skipped, not sent in a burst. A silent instrument goes on
+        navigating: only its output is missing.
         """
         names = self._schedule.due(now_ns)
+        if names:
+            self.solution(now_ns)
         if self._faults.is_silent:
             return ()
         self._transmitted += len(names)
@@ -180,13 +185,16 @@ class NavigationSystem:
         imu = _disturbed(truth.displaced(self._p.lever_arm_m), errors)
         self._felt = imu._replace(angular_accelerations_radps2=_filtered(self._felt, imu.rates_radps, dt_s))
         motion = _biased(self._felt.displaced(self._displacement_m), faults)
-        self._cover(math.hypot(motion.velocity_mps[0], motion.velocity_mps[1]) * dt_s, dt_s)
+        self._cover(math.hypot(motion.velocity_mps[0], motion.velocity_mps[1]))
         valid_ns = now_ns - age_steps * self._period_ns - self._start_ns
         return Solution(self._start_ms + valid_ns // _NS_PER_MS, motion, self._distance_m, self._held_distance_m)
 
-    def _cover(self, way_m: float, dt_s: float) -> None:
+    def _cover(self, speed_mps: float) -> None:
+        """Count the way of the periods observed since the last solution: in a stall of the caller the car stands still."""
+        way_m = speed_mps * self._unsolved_periods * self._period_ns / _NS_PER_S
+        self._unsolved_periods = 0
         self._distance_m += way_m
-        if way_m >= _HOLD_MPS * dt_s:
+        if speed_mps >= _HOLD_MPS:
             self._held_distance_m += way_m
 
     def _status(self, solution: Solution) -> Status:

@@ -5,10 +5,10 @@ exactly. It makes up for everything that resists, the driver's torque included, 
 A wheel that nobody holds returns to the centre slowly.
 """
 
-import cmath
 import math
 
 from dbc.vehicle import Vehicle
+from vehicle_emulator.actuators import second_order_transition
 from vehicle_emulator.plants.interface import SteeringInputs
 
 _INERTIA_KGM2 = 0.05
@@ -43,7 +43,7 @@ class SteeringWheel:
         self.robot_nm = 0.0
 
     def step(self, inputs: SteeringInputs) -> None:
-        """Turn for one period; the demand is where the robot is to be at its end."""
+        """Turn for one period, the demand held."""
         period_s, rate_radps = self._period_s, self.rate_radps
         centring = min(max(self.angle_rad / _CENTRED_RAD, -1.0), 1.0)
         outside_nm = inputs.driver_torque_nm - _DAMPING_NMS * (rate_radps + _CENTRING_RADPS * centring)
@@ -60,31 +60,11 @@ class SteeringWheel:
             self.angle_rad = math.copysign(self._limit_rad, self.angle_rad)
             self.rate_radps = 0.0
 
-    def impose(self, angle_rad: float, rate_radps: float) -> None:
-        """Put the wheel where another one is; the next step starts from there."""
-        self.angle_rad, self.rate_radps = angle_rad, rate_radps
-
     def _wanted(self, inputs: SteeringInputs) -> tuple[float, float]:
-        """Angle and rate at the end of the period with torque enough: the error from a demand that moves evenly dies away."""
+        """Angle and rate at the end of the period with torque enough."""
         from_error, from_rate, rate_from_error, rate_from_rate = self._transition
-        error_rad = self.angle_rad - (inputs.demand_rad - self._period_s * inputs.demand_rate_radps)
-        error_radps = self.rate_radps - inputs.demand_rate_radps
+        error_rad = self.angle_rad - inputs.demand_rad
         return (
-            inputs.demand_rad + from_error * error_rad + from_rate * error_radps,
-            inputs.demand_rate_radps + rate_from_error * error_rad + rate_from_rate * error_radps,
+            inputs.demand_rad + from_error * error_rad + from_rate * self.rate_radps,
+            rate_from_error * error_rad + rate_from_rate * self.rate_radps,
         )
-
-
-def second_order_transition(pole_radps: float, damping_ratio: float, period_s: float) -> tuple[float, float, float, float]:
-    """Matrix exponential of e'' + 2 zeta omega e' + omega^2 e = 0 over a period, row by row: what e and e' become."""
-    decay_radps = damping_ratio * pole_radps
-    spread_radps = cmath.sqrt(decay_radps**2 - pole_radps**2)
-    even = cmath.cosh(spread_radps * period_s).real
-    odd_s = (cmath.sinh(spread_radps * period_s) / spread_radps).real if spread_radps else period_s
-    decay = math.exp(-decay_radps * period_s)
-    return (
-        decay * (even + decay_radps * odd_s),
-        decay * odd_s,
-        -decay * pole_radps**2 * odd_s,
-        decay * (even - decay_radps * odd_s),
-    )

@@ -104,11 +104,6 @@ class CommonroadPlant:
         """The state reached by the last step."""
         return self._state
 
-    def impose_steering(self, angle_rad: float, rate_radps: float) -> None:
-        """Set angle and rate of the steering wheel; the next step starts from them."""
-        self._wheel.impose(angle_rad, rate_radps)
-        self._x[STEER] = angle_rad / self._vehicle.steering.ratio
-
     def step(self, dt_s: float, inputs: PlantInputs) -> PlantState:
         """Advance by `dt_s`, the period, with the inputs held and return the state reached."""
         if dt_s != self._period_s:

@@ -131,7 +131,6 @@ class FmuPlant:
             "steering_wheel_rate_radps": wheel.rate_radps,
             "road_wheel_rad": wheel.angle_rad / self._vehicle.steering.ratio,
             "steering_demand_rad": steering.demand_rad,
-            "steering_demand_rate_radps": steering.demand_rate_radps,
             "steering_torque_limit_nm": steering.torque_limit_nm,
             "driver_torque_nm": steering.driver_torque_nm,
             "accelerator_norm": inputs.accelerator_norm,

@@ -27,11 +27,11 @@ WHEEL_SPEEDS = tuple(f"wheel_speed_{wheel}_radps" for wheel in _WHEELS)
 WHEEL_LOADS = tuple(f"wheel_load_{wheel}_n" for wheel in _WHEELS)
 INPUTS = (
     *("steering_wheel_rad", "steering_wheel_rate_radps", "road_wheel_rad"),
-    *("steering_demand_rad", "steering_demand_rate_radps", "steering_torque_limit_nm", "driver_torque_nm"),
+    *("steering_demand_rad", "steering_torque_limit_nm", "driver_torque_nm"),
     *("accelerator_norm", "brake_norm", "gear", "drive_fault_norm", "brake_fault_norm", "push_n"),
     *("road_z_m", "road_slope_x", "road_slope_y", "road_friction"),
 )
-"""What an FMU can be given. The first three are our own steering wheel; the next four are for an FMU that has one itself. The gear is
+"""What an FMU can be given. The first three are our own steering wheel; the next three are for an FMU that has one itself. The gear is
 1, 0 or -1 by the selector; the road is that under the reference point."""
 OUTPUTS = (
     *(field for field in PlantState._fields if field not in ("wheel_speeds_radps", "wheel_loads_n")),

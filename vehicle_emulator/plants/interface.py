@@ -42,13 +42,12 @@ class SteeringInputs(NamedTuple):
     """What turns the steering wheel; the robot is a position servo of bandwidth and damping as the vehicle file says.
 
     Args:
-        demand_rad, demand_rate_radps: steering-wheel angle that the robot is to take now, and its rate.
+        demand_rad: steering-wheel angle that the robot is to take now.
         torque_limit_nm: largest torque of the robot; 0 when it lets go.
         driver_torque_nm: torque of the driver's hands.
     """
 
     demand_rad: float = 0.0
-    demand_rate_radps: float = 0.0
     torque_limit_nm: float = 0.0
     driver_torque_nm: float = 0.0
 

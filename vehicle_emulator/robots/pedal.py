@@ -13,8 +13,8 @@ from random import Random
 from dbc.catalogue import Catalogue
 from dbc.robots import PedalRobot as PedalRobotParameters
 from vehicle_emulator.actuators import DeadTime, MotionProfile, PedalSpring, PositionSensor, Servo, quantised
-from vehicle_emulator.robots.robot import LimitsHit, Robot, View
-from vehicle_emulator.robots.states import RobotState
+from vehicle_emulator.robots.receiver import Values
+from vehicle_emulator.robots.robot import Robot, View, limits_hit
 
 _RESTING_NORM = 1e-4
 """A pedal that comes back and is as close as this to its rest is there."""
@@ -51,6 +51,9 @@ class PedalRobot(Robot):
         self._servo = Servo(period_s, p.bandwidth_hz, p.damping_ratio)
         self._sensor = PositionSensor(p.resolution_norm, p.noise_norm, random)
         self._foot_norm = 0.0
+        self._was_stuck = False
+        self._values: Values = {}
+        self._rate_limit_per_s, self._reachable_norm = p.rate_limit_per_s, self._strongest_norm
 
     @property
     def position_norm(self) -> float:
@@ -61,7 +64,7 @@ class PedalRobot(Robot):
         """Position wanted by the newest command or by a stop, before all limits; as of the last step."""
         if self._stops(view):
             return self._stop_norm
-        if self.state is not RobotState.ENGAGED:
+        if not self.is_engaged:
             return 0.0
         values = self.command.values
         if self.mode == "Force":
@@ -71,28 +74,40 @@ class PedalRobot(Robot):
     def decide(self, view: View, foot_norm: float) -> None:
         """Decide on the state, before any robot moves."""
         self._foot_norm = foot_norm
-        is_astray = abs(self._profile.position - self.position_norm) > self._p.following_error_norm
-        self._update(view, is_astray, foot_norm - self.position_norm > self._p.override_norm)
+        position_norm = self._servo.position
+        is_astray = abs(self._profile.position - position_norm) > self._p.following_error_norm
+        self._update(view, is_astray, foot_norm - position_norm > self._p.override_norm)
 
     def move(self, view: View, demand_norm: float) -> float:
         """Move for one period and return where the pedal is."""
-        p, faults, values = self._p, self.faults, self.command.values
-        is_following = self.state is RobotState.ENGAGED
+        p, faults, is_following = self._p, self.faults, self.is_engaged
         if is_following:
-            rate_limit_per_s = min(1e-3 * values["RateLimit"] / p.stroke_m, p.rate_limit_per_s)
-            reachable_norm = self._spring.position_norm(min(values["ForceLimit"], p.force_limit_n))
+            rate_limit_per_s, reachable_norm = self._commanded_limits()
             demand_norm += faults.offset
         else:
             rate_limit_per_s, reachable_norm = p.rate_limit_per_s, self._strongest_norm
         clipped_norm = min(max(demand_norm, 0.0), 1.0)
         delayed_norm = quantised(self._dead_time.step(min(clipped_norm, reachable_norm)), p.resolution_norm)
-        before_norm = self._profile.position
+        if self._was_stuck and not faults.is_stuck:
+            self._profile.reset(self._servo.position)
+        before_norm, self._was_stuck = self._profile.position, faults.is_stuck
         target_norm = self._profile.step(delayed_norm, faults.slow_factor * rate_limit_per_s, faults.slow_factor)
-        if not faults.is_stuck and (target_norm or self.position_norm):
-            self._drive(*((0.0, 0.0) if self._has_let_go else (target_norm, (target_norm - before_norm) / self._period_s)))
+        if faults.is_stuck:
+            self._servo.reset(self._servo.position)
+        elif target_norm or self._servo.position:
+            self._drive(*((0.0, 0.0) if self.has_let_go else (target_norm, (target_norm - before_norm) / self._period_s)))
         is_at_rate = is_following and self._profile.is_at_rate_limit
-        self.limits_hit = LimitsHit(clipped_norm != demand_norm, is_at_rate, clipped_norm > reachable_norm)
-        return max(self.position_norm, self._foot_norm)
+        self.limits_hit = limits_hit(clipped_norm != demand_norm, is_at_rate, clipped_norm > reachable_norm)
+        return max(self._servo.position, self._foot_norm)
+
+    def _commanded_limits(self) -> tuple[float, float]:
+        """Largest speed, and how far the force reaches, by the command and by its own limits."""
+        p, values = self._p, self.command.values
+        if values is not self._values:
+            self._values = values
+            self._rate_limit_per_s = min(1e-3 * values["RateLimit"] / p.stroke_m, p.rate_limit_per_s)
+            self._reachable_norm = self._spring.position_norm(min(values["ForceLimit"], p.force_limit_n))
+        return self._rate_limit_per_s, self._reachable_norm
 
     def _drive(self, target_norm: float, target_rate_per_s: float) -> None:
         position_norm = self._servo.step(target_norm, target_rate_per_s, self.faults.slow_factor)
@@ -101,13 +116,9 @@ class PedalRobot(Robot):
             self._servo.reset(0.0)
 
     @property
-    def _has_let_go(self) -> bool:
-        return self.faults.drops_torque or self.state is RobotState.FAULT_HARD
-
-    @property
     def _force_n(self) -> float:
         """What its load cell measures: nothing when the foot has taken the pedal away, or without torque."""
-        if self._foot_norm > self.position_norm or self._has_let_go:
+        if self._foot_norm > self.position_norm or self.has_let_go:
             return 0.0
         return self._spring.force_n(self.position_norm, min(max(self._servo.rate / _FRICTION_PER_S, -1.0), 1.0))
 

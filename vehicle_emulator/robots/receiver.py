@@ -31,7 +31,7 @@ class CommandReceiver:
         self._spec = catalogue.by_name[name]
         self._e2e = None if self._spec.e2e_data_id is None else E2EReceiver(self._spec.e2e_data_id)
         self._accepts = accepts
-        self._fresh_until_ns: int | None = None
+        self._fresh_until_ns = -1
         self.arbitration_id = self._spec.arbitration_id
         self.values: Values = dict.fromkeys(catalogue.signals(name), 0.0)
         self.rejected: Counter[Dtc] = Counter()
@@ -48,11 +48,11 @@ class CommandReceiver:
 
     def is_fresh(self, now_ns: int) -> bool:
         """Whether the last good frame is no older than the timeout in the DBC."""
-        return self._fresh_until_ns is not None and now_ns <= self._fresh_until_ns
+        return now_ns <= self._fresh_until_ns
 
     def is_overdue(self, now_ns: int) -> bool:
         """Whether there have been good frames, and are none any more."""
-        return self._fresh_until_ns is not None and now_ns > self._fresh_until_ns
+        return 0 <= self._fresh_until_ns < now_ns
 
     def _judge(self, frame: CanFrame) -> Dtc | None:
         if len(frame.data) != self._spec.length_bytes:

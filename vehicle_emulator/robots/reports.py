@@ -22,7 +22,6 @@ _RIPPLE_S = 45.0
 _DROP_V = 0.5
 _CONTROLLER_RISE_K = 15.0
 """Assumptions: what a robot and its controller do at their limits for long, how fast, and a charged 12 V system."""
-_PAGE_NS = 100_000_000
 _LIMIT_PAGES = 3
 
 
@@ -84,14 +83,14 @@ class FaultMemory:
 
     def __init__(self) -> None:
         self._entries: dict[tuple[str, int], Entry] = {}
-        self._active: dict[str, frozenset[int]] = {}
+        self._noted: dict[str, tuple[frozenset[int], int]] = {}
 
     def note(self, now_s: float, node: str, troubles: frozenset[int], latched: int) -> None:
         """Take what is wrong with a node now."""
-        before = self._active.get(node, frozenset())
-        if troubles == before:
+        before, latched_before = self._noted.get(node, (frozenset(), 0))
+        if (troubles, latched) == (before, latched_before):
             return
-        self._active[node] = troubles
+        self._noted[node] = troubles, latched
         for dtc in sorted(troubles - before):
             entry = self._entries.setdefault((node, dtc), Entry(node, dtc, False, False, 0, now_s))
             entry.count = min(entry.count + 1, 255)
@@ -118,6 +117,7 @@ class FaultReport:
 
     def __init__(self, robots: Robots, nodes: dict[str, int]) -> None:
         self._nodes = nodes
+        self._next_page = 0
         sr, ar, br = robots.steering, robots.accelerator, robots.brake
         self._limits: tuple[dict[str, float], ...] = (
             {
@@ -130,9 +130,10 @@ class FaultReport:
             {"Page": 3, "BrStroke": 1e3 * br.stroke_m, "BrMaxForce": br.force_limit_n},
         )
 
-    def signals(self, now_ns: int, memory: FaultMemory) -> dict[str, float]:
-        """Signals of the page whose turn it is at this time."""
-        turn, is_limits = divmod(now_ns // _PAGE_NS, 2)
+    def signals(self, memory: FaultMemory) -> dict[str, float]:
+        """Signals of the next page; call it once for each frame."""
+        turn, is_limits = divmod(self._next_page, 2)
+        self._next_page += 1
         if is_limits:
             return self._limits[turn % _LIMIT_PAGES]
         entries = memory.entries

@@ -39,6 +39,17 @@ class LimitsHit(NamedTuple):
 
 
 FREE = LimitsHit()
+_WELL = (0, False, FREE, None)
+"""A `Robot.condition` without troubles."""
+
+
+def limits_hit(is_position: bool, is_rate: bool, is_force: bool) -> LimitsHit:
+    """Which limits are hit; usually none."""
+    return LimitsHit(is_position, is_rate, is_force) if is_position or is_rate or is_force else FREE
+
+
+_ENGAGED, _STANDBY, _FAULT_HARD, _SYSTEM_ENGAGED = RobotState.ENGAGED, RobotState.STANDBY, RobotState.FAULT_HARD, SystemState.ENGAGED
+"""For what is done every millisecond: Python 3.11 takes long to look up a member of an enumeration."""
 
 
 class Robot(ABC):
@@ -51,9 +62,9 @@ class Robot(ABC):
         modes: active modes, entries of the command's Mode table.
 
     Attributes:
-        is_overridden: whether the driver has taken over from this robot; until it is in standby again.
+        is_overridden: whether the driver has taken over from this robot; until it is in standby again and he has let go.
         faults: what is wrong with it; may be replaced at any step.
-        latched: code of the fault that it is in; 0 for none.
+        latched: code of the fault that it is in, the first one or the first hard one; 0 for none.
         limits_hit: in the last step.
     """
 
@@ -66,7 +77,7 @@ class Robot(ABC):
         self.latched = 0
         self.limits_hit = FREE
         table = catalogue.enumeration(f"{node}_Command", "Mode")
-        self._active_modes = {table[name]: name for name in modes}
+        self._active_modes: dict[float, str] = {table[name]: name for name in modes}
         self._modes = {table[name] for name in PASSIVE_MODES if name in table} | set(self._active_modes)
         self._states = catalogue.enumeration(f"{node}_Status", "State")
         self._codes = catalogue.enumeration(f"{node}_Diag", "Dtc")
@@ -91,9 +102,19 @@ class Robot(ABC):
         return self.machine.state
 
     @property
+    def is_engaged(self) -> bool:
+        """Whether it follows its command."""
+        return self.machine.state is _ENGAGED
+
+    @property
+    def has_let_go(self) -> bool:
+        """Whether it is without torque and force."""
+        return self.faults.drops_torque or self.machine.state is _FAULT_HARD
+
+    @property
     def mode(self) -> str | None:
         """Active mode of the newest good command."""
-        return self._active_modes.get(int(self.command.values["Mode"]))
+        return self._active_modes.get(self.command.values["Mode"])
 
     @property
     def is_ready(self) -> bool:
@@ -113,6 +134,8 @@ class Robot(ABC):
     @property
     def troubles(self) -> frozenset[int]:
         """Codes of what is wrong now: the fault that it is in, and warnings."""
+        if self.condition == _WELL:
+            return frozenset()
         warnings = (
             (self._is_overdue, Dtc.COMMAND_TIMEOUT),
             (self.limits_hit.is_position, Dtc.END_STOP),
@@ -145,17 +168,20 @@ class Robot(ABC):
             is_driver_stronger: whether the driver pulls or presses harder than the robot allows.
         """
         state, command = self.machine.state, self.command
-        was_engaged = state is RobotState.ENGAGED
+        was_engaged = state is _ENGAGED
         is_fresh = command.is_fresh(view.now_ns)
         self._is_overdue = not is_fresh and command.is_overdue(view.now_ns)
         self._is_timed_out = not (is_fresh and view.is_safety_fresh)
         is_lost = self._following_error.step(is_astray and was_engaged)
         is_taken = self._override.step(is_driver_stronger and was_engaged)
-        self.is_overridden = (is_taken or self.is_overridden) and state is not RobotState.STANDBY
+        self.is_overridden = is_taken or (self.is_overridden and (state is not _STANDBY or is_driver_stronger))
         found = self.faults.dtc or (self._codes[Dtc.FOLLOWING_ERROR] if is_lost else 0)
-        is_cleared = state in FAULTED and not found and self._clears(view, is_fresh)
-        self.latched = 0 if is_cleared else self.latched or found
-        follows = is_fresh and view.state is SystemState.ENGAGED and bool(command.values["Enable"]) and self.mode is not None
+        is_cleared = state in FAULTED and not found and self.clears(view)
+        if is_cleared:
+            self.latched = 0
+        elif found and (not self.latched or (self.latched in SOFT_CODES and found not in SOFT_CODES)):
+            self.latched = found
+        follows = is_fresh and view.state is _SYSTEM_ENGAGED and bool(command.values["Enable"]) and self.mode is not None
         situation = (state, view.state, view.is_overridden, self.latched, is_cleared, follows)
         if situation == self._settled:
             return state
@@ -177,13 +203,17 @@ class Robot(ABC):
         )
         return {event for event, is_true in events if is_true}
 
-    def _clears(self, view: View, is_fresh: bool) -> bool:
-        return view.state in RELEASED and (view.clears_faults or (is_fresh and bool(self.command.values["ClearFault"])))
+    def clears(self, view: View) -> bool:
+        """Whether its faults are to be cleared now: asked for all robots, or by its own command."""
+        is_asked = view.clears_faults or (bool(self.command.values["ClearFault"]) and self.command.is_fresh(view.now_ns))
+        return is_asked and view.state in RELEASED
 
     def _stops(self, view: View) -> bool:
-        """Whether it has to do its part in a stop: one that is on, or that its own fault is about to bring."""
-        if self.state is RobotState.FAULT_SOFT and view.state is SystemState.ENGAGED:
-            return True
+        """Whether it has to do its part in a stop: one that is on, or that its own fault is about to bring; never against the driver."""
+        if view.is_overridden:
+            return False
+        if view.state is _SYSTEM_ENGAGED:
+            return self.state is RobotState.FAULT_SOFT
         return view.state in STOPS and self.state is not RobotState.FAULT_HARD
 
     def _common_status(self) -> dict[str, float]:

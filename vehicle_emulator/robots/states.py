@@ -4,7 +4,7 @@
     Standby       released
     Armed         powered and released: the system is armed, or it is engaged and the robot's own command does not enable it
     Engaged       follows its command
-    Override      the driver has taken over; released until the system is disarmed
+    Override      the driver has taken over; released until the system is disarmed, in a stop as well
     SafeStop      does its part to stop the car
     EStop         the same, asked for by an emergency stop
     FaultSoft     does its part in a stop, follows nothing
@@ -44,20 +44,20 @@ class Event(Enum):
     HARD_FAULT = "a hard fault"
     SOFT_FAULT = "a soft fault"
     CLEARED = "faults are cleared and gone"
-    EMERGENCY_STOP = "the system is in an emergency stop"
-    CONTROLLED_STOP = "the system is in a controlled stop"
     DISARMED = "the system is disarmed"
     OVERRIDE = "the driver has taken over"
+    EMERGENCY_STOP = "the system is in an emergency stop"
+    CONTROLLED_STOP = "the system is in a controlled stop"
     FOLLOW = "the system is engaged, and the robot's own command enables it"
     ARMED = "the system is armed or engaged"
     NEXT = "the step of the start-up is over"
 
 
-_POWERED = (RobotState.STANDBY, RobotState.ARMED, RobotState.ENGAGED, RobotState.OVERRIDE)
+_POWERED = (RobotState.STANDBY, RobotState.ARMED, RobotState.ENGAGED)
 _STOPPING = (RobotState.SAFE_STOP, RobotState.EMERGENCY_STOP)
-FAULTED = (RobotState.FAULT_SOFT, RobotState.FAULT_HARD)
-STARTING = (RobotState.POWER_OFF, RobotState.INIT, RobotState.NOT_LEARNED, RobotState.LEARNING)
-READY = (RobotState.STANDBY, RobotState.ARMED, RobotState.ENGAGED)
+FAULTED = frozenset({RobotState.FAULT_SOFT, RobotState.FAULT_HARD})
+STARTING = frozenset({RobotState.POWER_OFF, RobotState.INIT, RobotState.NOT_LEARNED, RobotState.LEARNING})
+READY = frozenset({RobotState.STANDBY, RobotState.ARMED, RobotState.ENGAGED})
 """States in which a robot can do, now or when it is engaged, what it is told."""
 
 TRANSITIONS: dict[tuple[RobotState, Event], RobotState] = {
@@ -68,11 +68,10 @@ TRANSITIONS: dict[tuple[RobotState, Event], RobotState] = {
     **{(state, Event.HARD_FAULT): RobotState.FAULT_HARD for state in RobotState if state is not RobotState.FAULT_HARD},
     **{(state, Event.SOFT_FAULT): RobotState.FAULT_SOFT for state in RobotState if state not in FAULTED},
     **{(state, Event.CLEARED): RobotState.STANDBY for state in FAULTED},
-    **{(state, Event.EMERGENCY_STOP): RobotState.EMERGENCY_STOP for state in _POWERED},
+    **{(state, Event.EMERGENCY_STOP): RobotState.EMERGENCY_STOP for state in (*_POWERED, RobotState.SAFE_STOP)},
     **{(state, Event.CONTROLLED_STOP): RobotState.SAFE_STOP for state in _POWERED},
-    **{(state, Event.DISARMED): RobotState.STANDBY for state in (*_POWERED[1:], *_STOPPING)},
-    (RobotState.ENGAGED, Event.OVERRIDE): RobotState.OVERRIDE,
-    (RobotState.ARMED, Event.OVERRIDE): RobotState.OVERRIDE,
+    **{(state, Event.DISARMED): RobotState.STANDBY for state in (*_POWERED[1:], RobotState.OVERRIDE, *_STOPPING)},
+    **{(state, Event.OVERRIDE): RobotState.OVERRIDE for state in (*_POWERED[1:], *_STOPPING)},
     (RobotState.ARMED, Event.FOLLOW): RobotState.ENGAGED,
     (RobotState.ENGAGED, Event.FOLLOW): RobotState.ENGAGED,
     (RobotState.ENGAGED, Event.ARMED): RobotState.ARMED,
@@ -137,5 +136,8 @@ class Persistence:
 
     def step(self, is_true: bool) -> bool:
         """Note one period."""
-        self._count = min(self._count + 1, self._needed) if is_true else 0
+        if not is_true:
+            self._count = 0
+            return False
+        self._count = min(self._count + 1, self._needed)
         return self._count == self._needed

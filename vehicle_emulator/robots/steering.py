@@ -17,8 +17,8 @@ from dbc.robots import SteeringRobot as SteeringRobotParameters
 from vehicle_emulator.actuators import Backlash, DeadTime, MotionProfile, PositionSensor, quantised
 from vehicle_emulator.driver import Driver
 from vehicle_emulator.plants.interface import PlantState, SteeringInputs
-from vehicle_emulator.robots.robot import FREE, LimitsHit, Robot, View
-from vehicle_emulator.robots.states import RobotState
+from vehicle_emulator.robots.receiver import Values
+from vehicle_emulator.robots.robot import FREE, Robot, View, limits_hit
 
 _SATURATING_RAD = 100.0
 """An error that drives every servo into its torque limit, which then is the torque."""
@@ -49,35 +49,42 @@ class SteeringRobot(Robot):
         self._fading_from_nm = 0.0
         self._fading_since_ns: int | None = None
         self._stuck_at_rad: float | None = None
+        self._values: Values = {}
+        self._command_rad = self._rate_limit_radps = 0.0
 
     def step(self, view: View, feedback: PlantState, driver: Driver) -> SteeringInputs:
         """Decide and move for one period."""
         self._feedback = feedback
         error_rad = self._profile.position - feedback.steering_wheel_rad
         is_astray = abs(error_rad) > self._p.following_error_rad and self.mode != "Torque"
-        state = self._update(view, is_astray, abs(driver.steering_torque_nm) > self._p.override_nm)
+        self._update(view, is_astray, abs(driver.steering_torque_nm) > self._p.override_nm)
         is_at_end = False
-        if state is not RobotState.ENGAGED:
+        is_engaged = self.is_engaged
+        if not is_engaged:
             demand_rad, limit_nm = (self._hold_rad, self._faded_nm(view.now_ns)) if self._stops(view) else (self._release(), 0.0)
         else:
             demand_rad, limit_nm, is_at_end = self._torque() if self.mode == "Torque" else self._position()
             self._fading_from_nm, self._fading_since_ns = limit_nm, None
         demand_rad, limit_nm = self._as_broken(demand_rad, limit_nm)
-        if state is RobotState.ENGAGED:
+        if is_engaged:
             is_at_torque = 0.0 < _LIMIT_SHARE * limit_nm <= abs(feedback.steering_robot_nm)
-            self.limits_hit = LimitsHit(is_at_end, self._profile.is_at_rate_limit, is_at_torque)
+            self.limits_hit = limits_hit(is_at_end, self._profile.is_at_rate_limit, is_at_torque)
         else:
             self.limits_hit = FREE
-        return SteeringInputs(demand_rad, 0.0, limit_nm, driver.steering_torque_nm)
+        return SteeringInputs(demand_rad, limit_nm, driver.steering_torque_nm)
 
     def _position(self) -> tuple[float, float, bool]:
         """Demand, torque limit, and whether the command is beyond the learned end."""
         p, values, slow = self._p, self.command.values, self.faults.slow_factor
-        wanted_rad = math.radians(values["AngleCommand"]) + self.faults.offset
+        if values is not self._values:
+            self._values = values
+            self._command_rad = math.radians(values["AngleCommand"])
+            self._rate_limit_radps = min(math.radians(values["RateLimit"]), p.rate_limit_radps)
+        wanted_rad = self._command_rad + self.faults.offset
         clipped_rad = min(max(wanted_rad, -self._end_rad), self._end_rad)
         delayed_rad = quantised(self._dead_time.step(clipped_rad), p.resolution_rad)
-        rate_radps = slow * min(math.radians(values["RateLimit"]), p.rate_limit_radps)
-        before_rad, self._hold_rad = self._hold_rad, self._lash.step(self._profile.step(delayed_rad, rate_radps, slow))
+        profile_rad = self._profile.step(delayed_rad, slow * self._rate_limit_radps, slow)
+        before_rad, self._hold_rad = self._hold_rad, self._lash.step(profile_rad)
         # The column holds a demand for one period: it gets the mean.
         demand_rad = 0.5 * (before_rad + self._hold_rad) + values["TorqueFeedForward"] / self._stiffness_nmprad
         return demand_rad, min(values["TorqueLimit"], p.torque_limit_nm), clipped_rad != wanted_rad

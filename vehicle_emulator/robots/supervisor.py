@@ -4,13 +4,13 @@
     Disarmed         robots released, pedals retracted
     Armed            robots powered, released
     Engaged          robots follow their commands
-    ControlledStop   robots bring the car to a stop on their own; left by a Disarm at standstill only
-    EStop            the same, asked for by an emergency stop
+    ControlledStop   robots bring the car to a stop on their own; left by a Disarm at standstill, or for an emergency stop
+    EStop            the same, asked for by an emergency stop; left by a Disarm at standstill when nobody asks for it any more
     Fault            a robot has a fault, and nothing is engaged; left when it is cleared
 
-A robot that was never engaged stays neutral: the stops are reached from Engaged only. Disarming while Engaged hands the car to
+A robot that was never engaged stays neutral: a stop begins in Engaged only. Disarming while Engaged hands the car to
 the driver in it; disarming during a stop does not, because nobody may be there to take it. When the driver takes over, the robots
-let go and the system stays Engaged, so that the gateway learns why and disarms.
+let go and the system stays Engaged, so that the gateway learns why and disarms. It can arm again when the driver has let go.
 """
 
 from enum import StrEnum
@@ -90,10 +90,19 @@ class Supervisor:
     def __init__(self) -> None:
         self.state = SystemState.INIT
         self.stop_source = "None"
+        self._settled: SafetyInputs | None = None
 
     def update(self, inputs: SafetyInputs) -> None:
         """Take at most one transition."""
-        if self.state is SystemState.ENGAGED and (stop := _stop(inputs)) is not None:
+        if inputs == self._settled:
+            return
+        before = self.state
+        self._take(inputs)
+        self._settled = inputs if self.state is before else None
+
+    def _take(self, inputs: SafetyInputs) -> None:
+        may_stop = self.state is SystemState.ENGAGED or (self.state is SystemState.CONTROLLED_STOP and _is_emergency(inputs))
+        if may_stop and (stop := _stop(inputs)) is not None:
             self.state, self.stop_source = stop
         elif self.state in RELEASED and (resting := _resting(inputs)) is not self.state:
             self.state, self.stop_source = resting, "RobotFault" if resting is SystemState.FAULT else "None"
@@ -103,8 +112,10 @@ class Supervisor:
     def _requested(self, inputs: SafetyInputs) -> SystemState | None:
         """The state that the request leads to, or None when it leads nowhere now."""
         if self.state in STOPS:
-            return _TRANSITIONS.get((self.state, inputs.request)) if inputs.is_standing else None
-        must_disarm = inputs.is_stop_requested or inputs.is_stop_button_pressed or inputs.has_robot_fault
+            return _TRANSITIONS.get((self.state, inputs.request)) if inputs.is_standing and not _is_emergency(inputs) else None
+        if self.state is SystemState.DISARMED and inputs.is_overridden:
+            return None
+        must_disarm = _is_emergency(inputs) or inputs.has_robot_fault
         after = _TRANSITIONS.get((self.state, "Disarm" if must_disarm else inputs.request))
         return None if after is SystemState.ENGAGED and not _may_engage(inputs) else after
 
@@ -114,6 +125,10 @@ def _resting(inputs: SafetyInputs) -> SystemState:
     if not inputs.have_robots_started:
         return SystemState.INIT
     return SystemState.FAULT if inputs.has_robot_fault else SystemState.DISARMED
+
+
+def _is_emergency(inputs: SafetyInputs) -> bool:
+    return inputs.is_stop_button_pressed or inputs.is_stop_requested
 
 
 def _may_engage(inputs: SafetyInputs) -> bool:

@@ -7,6 +7,7 @@ count never arrived. The system stops when any of the four commands has not come
 has not changed for as long. What the robots do in a stop is told in `steering` and `pedal`.
 """
 
+import math
 from collections.abc import Sequence
 from random import Random
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from vehicle_emulator.robots.pedal import PedalRobot
 from vehicle_emulator.robots.receiver import CommandReceiver, Values
 from vehicle_emulator.robots.reports import SOFTWARE_VERSION, WARMING_NS, FaultMemory, FaultReport, Thermometer, controller_degc, supply_v
 from vehicle_emulator.robots.robot import Robot, View
-from vehicle_emulator.robots.states import Dtc, RobotState
+from vehicle_emulator.robots.states import FAULTED, STARTING, Dtc, RobotState
 from vehicle_emulator.robots.steering import SteeringRobot
 from vehicle_emulator.robots.supervisor import RELEASED, STANDING_MPS, STOPS, SafetyInputs, Supervisor, SystemState
 
@@ -108,9 +109,11 @@ class RobotSystem:
         self._start_ns = now_ns if self._start_ns is None else self._start_ns
         self._now_ns, self._driver = now_ns, driver
         self._receive(now_ns, frames)
-        self.supervisor.update(self._safety_inputs(now_ns, feedback.vx_mps))
+        inputs = self._safety_inputs(now_ns, math.hypot(feedback.vx_mps, feedback.vy_mps))
+        self.supervisor.update(inputs)
         self.was_engaged = self.was_engaged or self.is_engaged
-        view = self._view(now_ns)
+        clears_faults = inputs.request == "ClearFaults"
+        view = View(now_ns, self.supervisor.state, self._safety.is_fresh(now_ns), inputs.is_overridden, clears_faults)
         for node, robot in self._robots.items():
             robot.faults = self.faults[node]
         self._ar.decide(view, driver.accelerator_norm)
@@ -118,9 +121,9 @@ class RobotSystem:
         steering = self._sr.step(view, feedback, driver)
         brake_norm = self._br.demand_norm(view)
         accelerator_norm = self._ar.move(view, 0.0 if brake_norm > INTERLOCK_NORM else self._ar.demand_norm(view))
-        inputs = PlantInputs(steering, accelerator_norm, self._br.move(view, brake_norm), driver.selector)
+        brake_norm = self._br.move(view, brake_norm)
         self._remember(view)
-        return inputs
+        return PlantInputs(steering, accelerator_norm, brake_norm, driver.selector)
 
     def _accepts(self, values: Values) -> bool:
         """A session changes in standby only; in a stop as well, so that a gateway that was restarted can end it."""
@@ -135,39 +138,28 @@ class RobotSystem:
             if (challenge := receiver.values["WatchdogChallenge"]) != self._challenge:
                 self._challenge, self._challenged_ns = challenge, now_ns
 
-    def _request(self, now_ns: int) -> str:
-        return self._requests[int(self._safety.values["SystemRequest"])] if self._safety.is_fresh(now_ns) else "None"
-
     def _safety_inputs(self, now_ns: int, speed_mps: float) -> SafetyInputs:
-        safety, sr, ar, br = self._safety.values, self._sr, self._ar, self._br
+        safety, is_safety_fresh = self._safety.values, self._safety.is_fresh(now_ns)
         stale = [receiver for receiver in self._receivers.values() if not receiver.is_fresh(now_ns)]
+        states = self._sr.state, self._ar.state, self._br.state
         return SafetyInputs(
-            request=self._request(now_ns),
+            request=self._requests[int(safety["SystemRequest"])] if is_safety_fresh else "None",
             is_stop_button_pressed=self._driver.is_stop_button_pressed,
-            is_stop_requested=self._safety not in stale and bool(safety["EmergencyStopRequest"]),
+            is_stop_requested=is_safety_fresh and bool(safety["EmergencyStopRequest"]),
             are_commands_fresh=not stale,
             are_frames_bad=any(receiver.trouble in (Dtc.COMMAND_CRC, Dtc.COMMAND_COUNTER) for receiver in stale),
             is_watchdog_answered=now_ns - self._challenged_ns <= self._watchdog_timeout_ns,
             is_dead_man_pressed=self._driver.is_dead_man_pressed,
-            have_robots_started=sr.has_started and ar.has_started and br.has_started,
-            has_robot_fault=sr.has_fault or ar.has_fault or br.has_fault,
+            have_robots_started=STARTING.isdisjoint(states),
+            has_robot_fault=not FAULTED.isdisjoint(states),
             is_overridden=self._is_overridden,
-            is_too_fast=_KMH_PER_MPS * abs(speed_mps) > safety["MaxSpeed"],
-            is_standing=abs(speed_mps) < STANDING_MPS,
+            is_too_fast=_KMH_PER_MPS * speed_mps > safety["MaxSpeed"],
+            is_standing=speed_mps < STANDING_MPS,
         )
 
     @property
     def _is_overridden(self) -> bool:
         return self._sr.is_overridden or self._ar.is_overridden or self._br.is_overridden
-
-    def _view(self, now_ns: int) -> View:
-        return View(
-            now_ns,
-            self.supervisor.state,
-            is_safety_fresh=self._safety.is_fresh(now_ns),
-            is_overridden=self._is_overridden,
-            clears_faults=self._request(now_ns) == "ClearFaults",
-        )
 
     def _remember(self, view: View) -> None:
         """Keep the fault memory and, now and then, the temperatures up to date."""
@@ -180,7 +172,9 @@ class RobotSystem:
             for node, robot in self._robots.items():
                 self.memory.note(self._elapsed_s, node, robot.troubles, robot.latched)
         if view.clears_faults and view.state in RELEASED:
-            for node in ("RC", *NODES):
+            self.memory.clear("RC")
+        for node, robot in self._robots.items():
+            if robot.clears(view):
                 self.memory.clear(node)
         if view.now_ns >= self._next_warming_ns:
             self._next_warming_ns = view.now_ns + WARMING_NS
@@ -201,7 +195,7 @@ class RobotSystem:
         if message == SUPERVISOR_MESSAGE:
             return self._supervisor_status()
         if message == REPORT_MESSAGE:
-            return self._report.signals(self._now_ns, self.memory)
+            return self._report.signals(self.memory)
         node, _, kind = message.partition("_")
         return self._diagnosis(node) if kind == "Diag" else self._robots[node].status()
 
@@ -229,7 +223,9 @@ class RobotSystem:
             "DeadManPressed": self._driver.is_dead_man_pressed,
             "RemoteStopLinkUp": 1,
             "DriverOverride": self._is_overridden,
-            **{f"{node.capitalize()}Ready": robot.is_ready for node, robot in self._robots.items()},
+            "SrReady": self._sr.is_ready,
+            "ArReady": self._ar.is_ready,
+            "BrReady": self._br.is_ready,
             "BrakeFallback": state in STOPS and self._br.state is RobotState.FAULT_HARD,
             "SupplyVoltage": self._supply_v,
             "ControllerTemperature": controller_degc(self._elapsed_s),

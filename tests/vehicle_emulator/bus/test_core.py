@@ -179,15 +179,29 @@ def test_any_frame_can_be_disturbed_and_others_are_left_alone():
     assert core.disturbed_ids == 1
 
 
-def test_disturbances_of_one_identifier_add_up():
+def test_a_disturbance_takes_the_place_of_an_earlier_one_and_none_takes_it_back():
     core = bus()
-    core.disturb(FRAME.arbitration_id, 2)
-    core.disturb(FRAME.arbitration_id, 1)
+    core.disturb(FRAME.arbitration_id, 20)
+    core.disturb(FRAME.arbitration_id, 3)
+    core.disturb(None, 5)
+    core.disturb(None, 0)
+    core.disturb(0x200, 0)
+    assert core.disturbed_ids == 1
     core.transmit(1, FRAME, 0)
     core.advance(FOREVER_NS)
     assert core.nodes[1].tec == 23
-    with pytest.raises(ValueError, match="count 0 of a disturbance"):
-        core.disturb(None, 0)
+    with pytest.raises(ValueError, match="count -1 of a disturbance"):
+        core.disturb(None, -1)
+
+
+def test_a_disturbance_taken_back_between_two_attempts_lets_the_next_through():
+    core = bus()
+    core.disturb(FRAME.arbitration_id, 30)
+    core.transmit(1, FRAME, 0)
+    assert core.advance(DESTROYED_BITS * BIT_NS) == []
+    core.disturb(FRAME.arbitration_id, 0)
+    assert len(through(core.advance(FOREVER_NS))) == 1
+    assert core.nodes[1].tec == 7
 
 
 def test_a_sender_that_always_fails_goes_bus_off_and_its_receivers_passive_only():

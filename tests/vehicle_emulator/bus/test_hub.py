@@ -272,6 +272,10 @@ def test_disturbed_identifiers_are_bounded(hub, monkeypatch):
             node.disturb(arbitration_id, 1)
         assert eventually(lambda: hub.malformed == 2)
         assert hub.core.disturbed_ids == 3
+        for arbitration_id in range(3):
+            node.disturb(arbitration_id, 0)
+        assert eventually(lambda: hub.core.disturbed_ids == 0)
+        assert hub.malformed == 2
 
 
 def _shorten(connection):

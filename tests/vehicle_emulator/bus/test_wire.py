@@ -28,6 +28,7 @@ CONTROLS = [
     Settings(tuple(Filter(0x1FFFFFFF, 0x1FFFFFFF, False) for _ in range(MAX_FILTERS))),
     Restart(),
     Disturb(None, 32),
+    Disturb(4, 0),
     Disturb(0x1FFFFFFF, 1_000_000),
 ]
 
@@ -83,7 +84,7 @@ def test_any_packet_is_something_that_packs_again_or_a_wire_error(packet):
         (b"\x02", "control packet"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Reboot"}), "control packet: Invalid value 'Reboot'"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Hello", "version": "2"}), "Expected `int`, got `str`"),
-        (b"\x02" + msgspec.msgpack.encode({"type": "Disturb", "arbitration_id": None, "count": 0}), "Expected `int` >= 1"),
+        (b"\x02" + msgspec.msgpack.encode({"type": "Disturb", "arbitration_id": None, "count": -1}), "Expected `int` >= 0"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Disturb", "arbitration_id": 2**29, "count": 1}), "Expected `int` <= 536870911"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Settings", "filters": [[1, 2, None]] * 65}), "length <= 64"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Restart", "now": True}), "unknown field `now`"),

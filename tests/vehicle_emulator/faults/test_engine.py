@@ -183,19 +183,44 @@ def disturbances(run):
 def test_bus_errors_are_asked_for_once(bench):
     status = CATALOGUE.by_name["SR_Status"].arbitration_id
     run = bench({"kind": "bus_error", "messages": "SR_Status", "errors": 3, "from_s": 0.01, "duration_s": 0.05}).run(100)
-    assert disturbances(run) == {10: (Disturbance(status, 3),)}
+    assert disturbances(run) == {10: (Disturbance(status, 3),), 60: (Disturbance(status, 0),)}
     assert run.events == [(10, "bus_error", "begins"), (60, "bus_error", "ends")]
 
 
 def test_bus_errors_again_and_again(bench):
     run = bench({"kind": "bus_error", "messages": "*", "period_ms": 20.0, "from_s": 0.01, "until_s": 0.07}).run(100)
-    assert disturbances(run) == dict.fromkeys([10, 30, 50], (Disturbance(None, 1),))
+    assert disturbances(run) == dict.fromkeys([10, 30, 50], (Disturbance(None, 1),)) | {70: (Disturbance(None, 0),)}
 
 
-def test_bus_off_takes_as_many_errors_as_the_standard_says(bench):
+def test_what_is_cleared_leaves_nothing_on_the_wire(bench):
+    status = CATALOGUE.by_name["SR_Status"].arbitration_id
+    run = bench({"kind": "bus_error", "messages": "SR_Status", "errors": 1000}, {"kind": "bus_error", "messages": "SR_Status", "errors": 7})
+    run.run(10)
+    run.engine.clear(5_000_000_000 + 10 * MS, "bus_error")
+    run.run(10)
+    assert list(disturbances(run)) == [0]  # the other one is about the same message
+    run.engine.clear(5_000_000_000 + 20 * MS)
+    run.run(10)
+    assert disturbances(run) == {0: (Disturbance(status, 1000), Disturbance(status, 7)), 20: (Disturbance(status, 0),)}
+
+
+def test_a_condition_that_comes_and_goes_is_told_a_bounded_number_of_times(bench):
+    run = bench({**GUST, "condition": "engaged", "until_s": 0.9}, {"kind": "ins_freeze", "condition": "engaged"})
+    for step in range(1000):
+        run.situation = run.situation._replace(is_engaged=step % 2 == 1 or step > 800)
+        run.run(1)
+    most = engine_module.MAX_BEGINNINGS_NOTED
+    events = {name: [(step, event) for step, one, event in run.events if one == name] for name in ("gust", "ins_freeze")}
+    told = [(step, "begins" if step % 2 else "ends") for step in range(1, 2 * most + 2)]
+    assert events == {"gust": [*told, (900, "ends")], "ins_freeze": told}
+    run.engine.clear(5_000_000_000 + 1000 * MS)
+    assert [event.event for event in run.engine.take_events()] == ["cleared"]
+
+
+def test_bus_off_takes_as_many_errors_as_the_standard_says_and_a_reserve(bench):
     run = bench({"kind": "bus_off", "node": "SR"}).run(10)
     (step, ((identifier, errors),)), = disturbances(run).items()
-    assert (step, errors) == (0, 32)
+    assert (step, errors) == (0, 48)
     assert CATALOGUE.by_id[identifier].sender == "SR"
     assert CATALOGUE.by_id[identifier].cycle_time_ns == min(m.cycle_time_ns for m in CATALOGUE.by_name.values() if m.sender == "SR")
 

@@ -217,3 +217,45 @@ def test_probability(bench):
 def test_targets(bench, name, hit):
     run = bench({"kind": "drop", "messages": name}, messages=("SR_Status", "AR_Status", "PosLocal")).run(1)
     assert len(run.passed) == 3 - hit
+
+
+@pytest.mark.parametrize("share", [{"probability": 0.5}, {"every": 3}, {"until_s": 1.0}])
+def test_jitter_keeps_the_order_of_frames_that_it_does_not_hit(bench, share):
+    run = bench({"kind": "jitter", "jitter_ms": 100.0, **STATUS, **share}).run(2000)
+    numbers = [frame.data[2] + 256 * frame.data[3] for _, frame in run.passed]
+    assert numbers == sorted(numbers)
+    assert len(run.changed) > 30
+    assert run.times[-1] == 1990 or "until_s" not in share
+
+
+def test_delay_of_some_lets_the_others_overtake(bench):
+    run = bench({"kind": "delay", "delay_ms": 15.0, "every": 2, **STATUS}).run(60)
+    assert run.times == [10, 15, 30, 35, 50, 55]
+
+
+def test_what_is_held_is_not_looked_at_before_it_is_due(bench):
+    run = bench({"kind": "delay", "delay_ms": 10_000.0, "messages": "*"}, period=1).run(1)
+    (hold,) = (effect for effect in run.engine.faults[0]._effects.values() if effect.is_holding)
+    looked = []
+
+    class Due(int):
+        def __le__(self, other):
+            looked.append(other)
+            return int(self) <= other
+
+    hold._kept = [(Due(10**18 + place), place, frame) for place, (_, frame) in enumerate(run.sent * 1000)]
+    assert hold.release(10**18 - 1, is_active=True) == []
+    assert len(looked) == 1
+    assert [len(hold.release(10**18 + 9, is_active=True)), len(hold._kept)] == [10, 990]
+
+
+@pytest.mark.parametrize(("rate_hz", "most"), [(10_000.0, 10), (250.0, 1), (1_500.0, 2)])
+def test_babble_does_not_catch_up_after_a_pause(bench, rate_hz, most):
+    run = bench({"kind": "babble", "id": 1, "rate_hz": rate_hz}).run(20)
+    run.now += 5000
+    before = len(run.passed)
+    run.run(1)
+    assert len([frame for _, frame in run.passed[before:] if frame.arbitration_id == 1]) == most
+    before = len(run.passed)
+    run.run(1000)
+    assert len([frame for _, frame in run.passed[before:] if frame.arbitration_id == 1]) == pytest.approx(rate_hz, abs=1)

@@ -26,7 +26,7 @@ def driven(inputs, seconds, *, speed_mps=0.0, pose=(0.0, 0.0, 0.0)):
 
 
 def steering(road_wheel_rad):
-    return SteeringInputs(VEHICLE.steering.ratio * road_wheel_rad, 0.0, 60.0)
+    return SteeringInputs(VEHICLE.steering.ratio * road_wheel_rad, 60.0)
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

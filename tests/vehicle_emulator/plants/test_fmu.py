@@ -23,7 +23,7 @@ from vehicle_emulator.road import RoadDescription, make_road
 
 SOURCES = Path(__file__).parents[2] / "support" / "fmu"
 VEHICLE = load_vehicle()
-INPUTS = PlantInputs(SteeringInputs(0.8, 0.0, 60.0), accelerator_norm=0.4)
+INPUTS = PlantInputs(SteeringInputs(0.8, 60.0), accelerator_norm=0.4)
 STEP_S = 1e-3
 
 MAPPING_2 = """

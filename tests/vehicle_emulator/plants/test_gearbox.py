@@ -9,8 +9,10 @@ import pytest
 from dbc.powertrain import PowertrainParameters
 from dbc.vehicle import FOCUS, VehicleError, load_vehicle
 from tests.vehicle_emulator.plants.powertrain_rig import STEP_S, Rig, step_function
-from vehicle_emulator.plants.interface import Selector
+from vehicle_emulator.plants.interface import PlantInputs, Selector
 from vehicle_emulator.plants.multibody.gearbox import Gearbox, GearboxState
+from vehicle_emulator.plants.multibody.plant import MultibodyPlant
+from vehicle_emulator.road import RoadDescription, make_road
 
 IDLE_RADPS = 65.0
 
@@ -261,6 +263,25 @@ def test_a_direction_against_the_motion_is_refused_until_the_car_is_slow(p, sele
     box = gearbox(p)
     assert drive(box, p, 1.0, speed_mps, selector=selector)[-1].gear == 0
     assert drive(box, p, 1.5, 0.2 * speed_mps, selector=selector)[-1].gear == (1 if selector is Selector.DRIVE else -1)
+
+
+@pytest.mark.parametrize(("selector", "gear"), [(Selector.REVERSE, -1), (Selector.DRIVE, 1)])
+def test_a_gear_that_is_engaged_stays_when_the_car_rolls_the_other_way(p, selector, gear):
+    box = gearbox(p)
+    for speed_mps in (0.0, -gear * 1.0, -gear * 3.0, -gear * 5.0):
+        state = drive(box, p, 1.5, speed_mps, selector=selector)[-1]
+        assert (state.gear, state.clutch_norm > 0.0) == (gear, True)
+
+
+def test_a_car_that_has_rolled_back_drives_up_again(focus):
+    plant = MultibodyPlant(focus, make_road(RoadDescription(grade_percent=15.0)))
+    for _ in range(6000):
+        if plant.step(STEP_S, PlantInputs()).vx_mps < -2.0:
+            break
+    assert plant.state.vx_mps < -2.0
+    for _ in range(3000):
+        state = plant.step(STEP_S, PlantInputs(accelerator_norm=1.0))
+    assert (state.gear, state.vx_mps > 1.0) == (1, True)
 
 
 def test_the_pawl_ratchets_at_speed_and_holds_once_it_is_in(p):

@@ -93,7 +93,7 @@ def test_random_driving_with_gearbox_and_lift_stays_finite(name):
         plant = MultibodyPlant(vehicle, Level(random.uniform(0.3, 1.0)), speed_mps=random.uniform(0.0, 30.0), is_lifted=is_lifted)
         for k in range(5000):
             if k % 250 == 0:
-                steering = SteeringInputs(random.uniform(-8.0, 8.0), 0.0, 60.0, random.uniform(-5.0, 5.0))
+                steering = SteeringInputs(random.uniform(-8.0, 8.0), 60.0, random.uniform(-5.0, 5.0))
                 faults = PlantFaults(random.random(), random.random(), random.uniform(-2000.0, 2000.0))
                 inputs = PlantInputs(steering, pedal(random), pedal(random), random.choice(list(Selector)), faults)
             plant.step(0.001, inputs)

@@ -53,7 +53,7 @@ class LiftedWheel:
 
 
 class Bench:
-    """See the module; `speed_mps` and `driver` may be set between steps."""
+    """See the module; `speed_mps`, `sideways_mps` and `driver` may be set between steps."""
 
     def __init__(self, vehicle: Vehicle = VEHICLE, seed: int = 1, wheel: LiftedWheel | None = None) -> None:
         self.gateway = GatewayStub(CATALOGUE)
@@ -61,6 +61,7 @@ class Bench:
         self.wheel = wheel or SteeringWheel(vehicle, 1e-3)
         self.ms = 0
         self.speed_mps = 20.0
+        self.sideways_mps = 0.0
         self.driver = Driver()
         self.inputs = PlantInputs()
 
@@ -68,6 +69,7 @@ class Bench:
     def feedback(self) -> PlantState:
         return PlantState(
             vx_mps=self.speed_mps,
+            vy_mps=self.sideways_mps,
             steering_wheel_rad=self.wheel.angle_rad,
             steering_wheel_rate_radps=self.wheel.rate_radps,
             steering_robot_nm=self.wheel.robot_nm,

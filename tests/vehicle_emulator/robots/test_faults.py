@@ -12,6 +12,7 @@ from vehicle_emulator.robots.reports import FaultMemory
 from vehicle_emulator.robots.states import SOFT_CODES
 
 HARD, SOFT = DTC["EncoderFault"], DTC["SpeedLimit"]
+PEDAL = VEHICLE.robots.accelerator
 NODE_OF = {raw: name for name, raw in CATALOGUE.enumeration("RC_FaultReport", "Robot").items()}
 
 
@@ -52,6 +53,33 @@ def test_a_hard_fault_lets_go_at_once_and_a_soft_one_fades():
         bench.step()
         bench.step()
         assert bench.inputs.steering.torque_limit_nm == pytest.approx(limit_nm, abs=0.5)
+
+
+def test_a_hard_fault_replaces_a_soft_one_and_not_the_other_way_round():
+    bench = Bench().engage()
+    bench.system.faults["BR"] = RobotFaults(dtc=SOFT)
+    bench.run(600)
+    assert (bench.robot_state("BR"), bench.status("BR_Diag")["Dtc"]) == ("FaultSoft", SOFT)
+    for code in (HARD, SOFT):
+        bench.system.faults["BR"] = RobotFaults(dtc=code)
+        bench.run(600)
+        assert (bench.robot_state("BR"), bench.status("BR_Diag")["Dtc"]) == ("FaultHard", HARD)
+    assert bench.inputs.brake_norm == 0.0
+    pages = report(bench)
+    shown = {code: (pages[f"BR {code}"]["Active"], pages[f"BR {code}"]["Latched"]) for code in (SOFT, HARD)}
+    assert shown == {SOFT: (0, 0), HARD: (1, 1)}
+
+
+def test_a_robot_forgets_when_its_own_command_clears_its_faults():
+    bench = Bench().engage()
+    bench.system.faults |= dict.fromkeys(("AR", "BR"), RobotFaults(dtc=SOFT))
+    bench.run(50)
+    bench.system.faults |= dict.fromkeys(("AR", "BR"), HEALTHY)
+    bench.speed_mps = 0.0
+    bench.run(50, "Disarm")
+    bench.send(50, lambda: [*bench.gateway.frames("Disarm")[:3], bench.gateway.pedal("BR", 0.0, False, ClearFault=1)])
+    assert [(entry.node, entry.dtc, entry.is_latched) for entry in bench.system.memory.entries] == [("AR", SOFT, True)]
+    assert (bench.robot_state("AR"), bench.robot_state("BR")) == ("FaultSoft", "Standby")
 
 
 @pytest.mark.parametrize("code", [HARD, SOFT])
@@ -119,6 +147,24 @@ def test_a_stuck_pedal_stays_where_it_is(node: str):
     assert bench.state == "ControlledStop"
 
 
+def test_a_pedal_that_seized_on_its_way_goes_on_from_rest():
+    bench = Bench().engage().run(220, ar_percent=100.0)
+    bench.system.faults["AR"] = RobotFaults(is_stuck=True)
+    bench.run(1, ar_percent=100.0)
+    at_norm = bench.system.pedals.accelerator_norm
+    assert 0.7 < at_norm < 0.98  # it was moving
+    bench.run(2000, "Disarm")
+    assert bench.system.pedals.accelerator_norm == at_norm
+    held_n = PEDAL.preload_n + (PEDAL.full_stroke_n - PEDAL.preload_n) * at_norm  # at rest: no friction
+    assert bench.status("AR_Status")["ForceActual"] == pytest.approx(held_n, abs=2.0)
+    bench.system.faults["AR"] = HEALTHY
+    track = [at_norm] + [bench.run(1, "Disarm").system.pedals.accelerator_norm for _ in range(500)]
+    steps = [before - after for before, after in pairwise(track)]
+    assert steps[0] < 0.5e-3 * PEDAL.rate_limit_per_s
+    assert 0.0 <= min(steps) <= max(steps) < 1.1e-3 * PEDAL.rate_limit_per_s
+    assert track[-1] == 0.0
+
+
 def test_a_slow_robot_moves_at_its_share():
     healthy, slow = Bench().engage(), Bench().engage()
     slow.system.faults |= dict.fromkeys(("SR", "AR"), RobotFaults(slow_factor=0.1))
@@ -178,16 +224,15 @@ def test_the_report_has_every_trouble_and_the_learned_limits():
     assert pages["page 3"] == {"Page": 3, "BrStroke": 1e3 * br.stroke_m, "BrMaxForce": br.force_limit_n}
 
 
-def test_pages_take_turns():
-    bench = Bench().silence(1)
+@pytest.mark.parametrize("cycle_ms", [10, 100, 137, 200])
+def test_pages_take_turns_at_any_cycle_time(cycle_ms: int):
+    bench = Bench()
     pages = []
-    for _ in range(6):
+    for _ in range(8):
+        bench.silence(cycle_ms)
         pages.append(int(bench.status("RC_FaultReport")["Page"]))
-        bench.ms += 99
-        bench.step()
-    assert sorted(pages[0::2] + pages[1::2]) == [0, 0, 0, 1, 2, 3]
-    assert 0 in (pages[0], pages[1])
-    assert bench.status("RC_FaultReport").get("Robot", 0) == 0
+    assert pages == [0, 1, 0, 2, 0, 3, 0, 1]
+    assert bench.status("RC_FaultReport")["Robot"] == 0
 
 
 def test_memory_counts_comings_and_forgets_what_is_gone():
@@ -201,6 +246,13 @@ def test_memory_counts_comings_and_forgets_what_is_gone():
     memory.note(400.0, "SR", frozenset({33}), 33)
     memory.clear("SR")
     assert [(e.node, e.dtc, e.is_latched) for e in memory.entries] == [("AR", 2, False), ("SR", 33, True)]
+
+
+def test_memory_notes_that_a_warning_has_become_the_fault():
+    memory = FaultMemory()
+    memory.note(0.0, "BR", frozenset({1}), 0)
+    memory.note(1.0, "BR", frozenset({1}), 1)
+    assert [(e.dtc, e.count, e.is_active, e.is_latched) for e in memory.entries] == [(1, 1, True, True)]
 
 
 def test_diagnosis_is_plausible_and_slow():

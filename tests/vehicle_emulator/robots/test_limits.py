@@ -4,9 +4,10 @@ import math
 
 import pytest
 
-from tests.vehicle_emulator.robots.bench import VEHICLE, Bench, command_of
+from tests.vehicle_emulator.robots.bench import DTC, VEHICLE, Bench, command_of
 from vehicle_emulator.driver import Driver
 from vehicle_emulator.plants.interface import Selector
+from vehicle_emulator.robots.faults import RobotFaults
 from vehicle_emulator.robots.system import NODES
 
 
@@ -113,6 +114,39 @@ def test_the_driver_takes_over_from_each_robot(node: str, hard: dict, soft: dict
     bench.run(100, "Disarm")
     assert bench.status("RC_SafetyStatus")["DriverOverride"] == 0
     assert (bench.state, bench.robot_state("SR")) == ("Disarmed", "Standby")
+
+
+@pytest.mark.parametrize("button", [False, True])
+def test_after_an_override_the_robots_stay_released_in_a_stop(button: bool):
+    bench = override(steering_torque_nm=20.0).run(300, sr_deg=20.0, ar_percent=30.0)
+    bench.driver = Driver(is_stop_button_pressed=button)
+    bench.silence(500)  # the gateway has died
+    assert bench.state == ("EStop" if button else "ControlledStop")
+    bench.system.faults["BR"] = RobotFaults(dtc=DTC["SpeedLimit"])  # a soft fault presses no brake against the driver either
+    bench.silence(500)
+    assert [bench.robot_state(name) for name in NODES] == ["Override", "Override", "FaultSoft"]
+    assert bench.inputs.steering.torque_limit_nm == 0.0
+    assert bench.system.pedals == (0.0, 0.0)
+
+
+def test_an_override_wins_over_a_stop_of_the_same_millisecond():
+    bench = override(steering_torque_nm=20.0).run(round(1e3 * VEHICLE.robots.steering.override_time_s) - 1)
+    bench.driver = Driver(steering_torque_nm=20.0, is_dead_man_pressed=False)
+    bench.run(3)
+    assert bench.state == "ControlledStop"
+    assert {bench.robot_state(name) for name in NODES} == {"Override"}
+
+
+def test_an_override_lasts_over_a_disarm_while_the_driver_pulls():
+    bench = override(steering_torque_nm=20.0).run(300).run(100, "Disarm")
+    assert (bench.state, bench.robot_state("SR")) == ("Disarmed", "Standby")
+    assert bench.status("RC_SafetyStatus")["DriverOverride"] == 1
+    bench.run(50, "Arm").run(50, "Engage").run(50, "Arm")
+    assert bench.state == "Disarmed"
+    bench.driver = Driver()
+    bench.run(50, "Arm").run(50, "Engage")
+    assert bench.state == "Engaged"
+    assert bench.status("RC_SafetyStatus")["DriverOverride"] == 0
 
 
 def test_a_short_pull_is_no_override():

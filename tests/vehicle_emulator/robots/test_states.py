@@ -44,13 +44,14 @@ def test_the_table_is_what_the_module_says():
     def leads(*before: RobotState, event: Event, after: RobotState) -> None:
         assert {state for state in RobotState if TRANSITIONS.get((state, event)) is after} == set(before)
 
-    powered = (RobotState.STANDBY, RobotState.ARMED, RobotState.ENGAGED, RobotState.OVERRIDE)
+    powered = (RobotState.STANDBY, RobotState.ARMED, RobotState.ENGAGED)
+    stopping = (RobotState.SAFE_STOP, RobotState.EMERGENCY_STOP)
     leads(RobotState.ARMED, RobotState.ENGAGED, event=Event.FOLLOW, after=RobotState.ENGAGED)
-    leads(RobotState.ARMED, RobotState.ENGAGED, event=Event.OVERRIDE, after=RobotState.OVERRIDE)
+    leads(RobotState.ARMED, RobotState.ENGAGED, *stopping, event=Event.OVERRIDE, after=RobotState.OVERRIDE)
     leads(RobotState.STANDBY, RobotState.ENGAGED, event=Event.ARMED, after=RobotState.ARMED)
     leads(*powered, event=Event.CONTROLLED_STOP, after=RobotState.SAFE_STOP)
-    leads(*powered, event=Event.EMERGENCY_STOP, after=RobotState.EMERGENCY_STOP)
-    leads(*powered[1:], RobotState.SAFE_STOP, RobotState.EMERGENCY_STOP, event=Event.DISARMED, after=RobotState.STANDBY)
+    leads(*powered, RobotState.SAFE_STOP, event=Event.EMERGENCY_STOP, after=RobotState.EMERGENCY_STOP)
+    leads(*powered[1:], RobotState.OVERRIDE, *stopping, event=Event.DISARMED, after=RobotState.STANDBY)
     leads(RobotState.FAULT_SOFT, RobotState.FAULT_HARD, event=Event.CLEARED, after=RobotState.STANDBY)
     assert {state for state, _ in TRANSITIONS} == set(RobotState)
 
@@ -176,8 +177,29 @@ def test_an_armed_system_disarms_for_what_stops_an_engaged_one(cause: str):
 
 def test_a_stop_with_a_faulty_robot_is_not_left_by_itself():
     rc = supervisor_in(SystemState.CONTROLLED_STOP)
-    rc.update(GOOD._replace(request="Engage", has_robot_fault=True, is_stop_requested=True, is_standing=True))
+    rc.update(GOOD._replace(request="Engage", has_robot_fault=True, is_standing=True))
     assert rc.state is SystemState.CONTROLLED_STOP
+
+
+@pytest.mark.parametrize(("cause", "source"), [("is_stop_button_pressed", "CabinButton"), ("is_stop_requested", "GatewayRequest")])
+def test_an_emergency_stop_replaces_a_controlled_one_and_lasts_while_it_is_asked_for(cause: str, source: str):
+    rc = supervisor_in(SystemState.ENGAGED)
+    rc.update(GOOD._replace(request="Engage", is_dead_man_pressed=False))
+    assert (rc.state, rc.stop_source) == ("ControlledStop", "DeadmanReleased")
+    rc.update(GOOD._replace(request="Disarm", is_standing=True, **{cause: True}))
+    assert (rc.state, rc.stop_source) == ("EStop", source)
+    rc.update(GOOD._replace(request="Disarm", is_standing=True, has_robot_fault=True, **{cause: True}))
+    assert (rc.state, rc.stop_source) == ("EStop", source)
+    rc.update(GOOD._replace(request="Disarm", is_standing=True))
+    assert (rc.state, rc.stop_source) == ("Disarmed", "None")
+
+
+def test_nothing_is_armed_while_the_driver_still_pulls():
+    rc = supervisor_in(SystemState.DISARMED)
+    rc.update(GOOD._replace(request="Arm", is_overridden=True))
+    assert rc.state is SystemState.DISARMED
+    rc.update(GOOD._replace(request="Arm"))
+    assert rc.state is SystemState.ARMED
 
 
 def test_faults_show_while_nothing_is_engaged_and_go_with_their_cause():

@@ -165,7 +165,7 @@ def test_play_is_felt_when_the_wheel_turns_back():
 
 def test_an_engagement_begins_where_the_wheel_is():
     bench = Bench()
-    bench.wheel.impose(math.radians(40.0), 0.0)
+    bench.wheel.angle_rad = math.radians(40.0)
     bench.run(50, "Disarm", sr_deg=40.0).run(30, "Arm", sr_deg=40.0)
     before = bench.wheel.angle_rad
     start_deg = math.degrees(before)

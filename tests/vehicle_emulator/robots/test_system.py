@@ -177,6 +177,27 @@ def test_a_car_faster_than_the_gateway_allows_is_stopped():
     assert (bench.state, bench.stop_source) == ("ControlledStop", "SpeedLimit")
 
 
+def test_sideways_counts_as_motion():
+    bench = Bench().engage()
+    gateway, bench.speed_mps, bench.sideways_mps = bench.gateway, 0.0, -20.0
+    bench.send(50, lambda: [gateway.safety("Engage", MaxSpeed=71), *gateway.frames("Engage")[1:]])
+    assert (bench.state, bench.stop_source) == ("ControlledStop", "SpeedLimit")
+    bench.run(100, "Disarm")
+    assert bench.state == "ControlledStop"  # it slides
+    bench.sideways_mps = 0.0
+    bench.run(100, "Disarm")
+    assert bench.state == "Disarmed"
+
+
+def test_the_stop_button_turns_a_controlled_stop_into_an_emergency_stop():
+    bench = Bench().engage().run(50, "ControlledStop")
+    bench.driver = Driver(is_stop_button_pressed=True)
+    bench.run(20, "ControlledStop")
+    assert (bench.state, bench.stop_source) == ("EStop", "CabinButton")
+    assert bench.status("RC_SafetyStatus")["EmergencyStopActive"] == 1
+    assert {bench.robot_state(node) for node in NODES} == {"EStop"}
+
+
 def test_disarming_hands_the_car_over_at_once():
     bench = Bench().engage().run(500, sr_deg=30.0, ar_percent=50.0).run(20, "Disarm", sr_deg=30.0)
     assert bench.state == "Disarmed"

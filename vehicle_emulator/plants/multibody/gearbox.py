@@ -21,7 +21,7 @@ _LEVEL_PEDAL = 0.1
 _PLAUSIBLE_MPS2 = 12.0
 """No car changes its speed faster: wheels that lock or spin do not shift the gearbox through."""
 _ENGAGE_MPS = 1.5
-"""Drive or reverse is refused against a car that rolls faster the other way."""
+"""Drive or reverse is not engaged against a car that rolls faster the other way; one that is engaged stays."""
 _PARK_MPS = 0.8
 """The pawl ratchets above this speed."""
 _RATIO_BEGIN, _RATIO_END = 0.3, 0.65
@@ -31,6 +31,10 @@ _IDLING_RADPS = 80.0
 """No engine follows a turbine that is slower."""
 _MATCHED_RADPS = 40.0
 """Slip below which a shift closes its clutch; it does so at any slip when it takes twice as long as it should."""
+
+
+_DIRECTION = {Selector.DRIVE: 1, Selector.REVERSE: -1}
+_PARK = Selector.PARK
 
 
 class GearboxState(NamedTuple):
@@ -64,6 +68,8 @@ class Gearbox:
         up = (p.upshift_light_mps, p.upshift_quarter_mps, p.upshift_half_mps, p.upshift_full_mps)
         down = (p.downshift_light_mps, p.downshift_quarter_mps, p.downshift_half_mps, p.downshift_full_mps)
         self._up, self._down = (tuple(zip(*columns, strict=True)) for columns in (up, down))
+        # By gear; reverse, -1, is the last.
+        self._ratios = (0.0, *(p.final_drive * ratio for ratio in p.ratios), p.final_drive * -p.reverse_ratio)
         self._speed_mps: float | None = None
         self._pedal = 0.0
         self._closed_norm = 0.0
@@ -82,7 +88,7 @@ class Gearbox:
         """Begin in a forward gear with its clutches closed, for a car that starts at speed."""
         self._from_gear = gear
         self._closed_norm = 1.0
-        self._state = GearboxState(gear, self._ratio(gear), 1.0, float(gear >= self._p.lockup_gear))
+        self._state = GearboxState(gear, self._ratios[gear], 1.0, float(gear >= self._p.lockup_gear))
 
     def gear_at(self, speed_mps: float) -> int:
         """The gear for a steady speed on a level road."""
@@ -111,7 +117,7 @@ class Gearbox:
         self._pedal += (accelerator_norm - self._pedal) * dt_s / (_PEDAL_RISE_S if accelerator_norm > self._pedal else _PEDAL_FALL_S)
         gear = self._engage(dt_s, selector, accelerator_norm, speed_mps)
         if gear > 0:
-            turbine_radps = self._ratio(gear) * driven_wheels_radps
+            turbine_radps = self._ratios[gear] * driven_wheels_radps
             self._advance(dt_s, abs(engine_radps - max(turbine_radps, _IDLING_RADPS)) < _MATCHED_RADPS)
             gear = self._decide(gear, accelerator_norm, speed_mps, engine_radps)
         ratio = self._blended_ratio(gear)
@@ -120,17 +126,18 @@ class Gearbox:
             ratio,
             self._closed_norm * self._hole(),
             self._lockup(dt_s, gear, ratio * driven_wheels_radps),
-            selector is Selector.PARK and (self._state.is_park_locked or abs(speed_mps) < _PARK_MPS),
+            selector is _PARK and (self._state.is_park_locked or abs(speed_mps) < _PARK_MPS),
         )
         return self._state
 
     def _engage(self, dt_s: float, selector: Selector, accelerator_norm: float, speed_mps: float) -> int:
         """Follow the lever: open the clutch, change direction, close it again; returns the gear."""
         p, gear = self._p, self._state.gear
-        wanted = {Selector.DRIVE: 1, Selector.REVERSE: -1}.get(selector, 0)
-        if wanted * speed_mps < -_ENGAGE_MPS:
+        wanted = _DIRECTION.get(selector, 0)
+        direction = (gear > 0) - (gear < 0)
+        if wanted != direction and wanted * speed_mps < -_ENGAGE_MPS:
             wanted = 0
-        is_there = (gear > 0) - (gear < 0) == wanted
+        is_there = direction == wanted
         if not is_there and self._closed_norm == 0.0:
             gear = self.gear_at(speed_mps) if wanted > 0 else wanted
             self._from_gear, self._shift_norm, is_there = gear, 1.0, True
@@ -172,17 +179,14 @@ class Gearbox:
             gear -= 1
         return gear
 
-    def _ratio(self, gear: int) -> float:
-        if gear == 0:
-            return 0.0
-        return self._p.final_drive * (self._p.ratios[gear - 1] if gear > 0 else -self._p.reverse_ratio)
-
     def _blended_ratio(self, gear: int) -> float:
-        share = _smooth((self._shift_norm - _RATIO_BEGIN) / (_RATIO_END - _RATIO_BEGIN))
-        return self._ratio(self._from_gear) + share * (self._ratio(gear) - self._ratio(self._from_gear))
+        before, after = self._ratios[self._from_gear], self._ratios[gear]
+        return before + _smooth((self._shift_norm - _RATIO_BEGIN) / (_RATIO_END - _RATIO_BEGIN)) * (after - before)
 
     def _hole(self) -> float:
         """What a shift leaves of the clutch: nothing in a downshift, in which it would brake the car with the engine."""
+        if self._shift_norm == 1.0:
+            return 1.0
         open_share = _smooth(self._shift_norm / _RATIO_BEGIN) - _smooth((self._shift_norm - _RATIO_END) / (1.0 - _RATIO_END))
         rest_norm = self._p.shift_clutch_norm if self._last_direction > 0 else 0.0
         return 1.0 - (1.0 - rest_norm) * open_share
@@ -204,10 +208,12 @@ def _interpolated(speeds_mps: tuple[float, ...], pedal: float) -> float:
 
 
 def _within(value: float, limit: float) -> float:
-    return min(max(value, -limit), limit)
+    return value if -limit <= value <= limit else min(max(value, -limit), limit)
 
 
 def _smooth(x: float) -> float:
     """From 0 at 0 to 1 at 1, with a continuous derivative."""
-    x = min(max(x, 0.0), 1.0)
+    if x >= 1.0:
+        return 1.0
+    x = max(x, 0.0)
     return x * x * (3.0 - 2.0 * x)

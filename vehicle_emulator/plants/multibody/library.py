@@ -22,7 +22,6 @@ _KEYED_SOURCES = (
 )  # fmt: skip
 _GENERATED = "equations.c"
 _INLINED = {"return fmin(x, y);": "return x < y ? x : y;", "return fmax(x, y);": "return x > y ? x : y;"}
-_Reals = ctypes.POINTER(ctypes.c_double)
 
 
 def build(car: CarParameters, progress: Callable[[str], None]) -> Build:
@@ -73,9 +72,11 @@ class CompiledCar:
         values = numbers(car)
         self._parameters = (ctypes.c_double * len(values))(*values)
         self._advance = self._library.advance
-        self._advance.argtypes = [_Reals, _Reals, _Reals, _Reals, ctypes.c_double, ctypes.c_int]
+        self._advance.argtypes = [*[ctypes.c_void_p] * 4, ctypes.c_double, ctypes.c_int]
         self._advance.restype = None
+        # Addresses, because a thousand times a second ctypes would make four pointers.
+        self._memory = tuple(map(ctypes.addressof, (self.state, self.outputs, self.inputs, self._parameters)))
 
     def advance(self, step_s: float, steps: int = 1) -> None:
         """Advance `state` by some steps with `inputs` held, and fill `outputs`."""
-        self._advance(self.state, self.outputs, self.inputs, self._parameters, step_s, steps)
+        self._advance(*self._memory, step_s, steps)

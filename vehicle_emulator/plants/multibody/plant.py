@@ -125,8 +125,10 @@ class MultibodyPlant(Plant):
     def _observed(self) -> PlantState:
         y = self._car.outputs[:]
         self._yaw_rad += math.remainder(y[5] - self._yaw_rad, math.tau)
-        fields = (*y[:5], self._yaw_rad, *y[6:12], *y[_FELT], *y[12:14], y[_ROBOT], tuple(y[14:18]), tuple(y[_LOADS]), y[18])
-        return PlantState._make((*fields, self._gearbox.state.gear))
+        y[5] = self._yaw_rad
+        return PlantState._make(
+            (*y[:12], *y[_FELT], *y[12:14], y[_ROBOT], tuple(y[14:18]), tuple(y[_LOADS]), y[18], self._gearbox.state.gear)
+        )
 
     def _settle(self, pose: tuple[float, float, float]) -> None:
         """Stand or hang at rest at a pose."""

@@ -1,0 +1,62 @@
+"""What the modules of the command line share: exit codes, options, daemons, output."""
+
+import importlib
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+EXIT_FAIL, EXIT_USER, EXIT_SETUP, EXIT_INTERRUPTED = 1, 2, 3, 130
+
+VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
+PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
+JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object instead of a table")]
+
+
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set; a daemon then ends in order."""
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    yield stop
+
+
+def run_daemon(module: str, make_options: Callable[[Any], object]) -> None:
+    """Run `module.run` with its options until a signal comes."""
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", stream=sys.stderr)
+    daemon = importlib.import_module(module)
+    with stop_on_signal() as stop:
+        daemon.run(make_options(daemon), stop)
+
+
+def progress(text: str) -> None:
+    """Tell what goes on, apart from the output."""
+    print(text, file=sys.stderr)
+
+
+def as_json_text(content: object) -> str:
+    """What is to be shown, as one line for programs."""
+    import json  # noqa: PLC0415
+
+    import msgspec  # noqa: PLC0415
+
+    return json.dumps(content, default=msgspec.to_builtins)
+
+
+def show(content: object, as_json: bool) -> None:
+    """Print a table for people, or with `as_json` an object for programs."""
+    if as_json:
+        print(as_json_text(content))
+    else:
+        from rich.console import Console  # noqa: PLC0415
+
+        # A table keeps its columns when it is piped into a file.
+        Console(width=None if sys.stdout.isatty() else int(os.environ.get("COLUMNS", "140"))).print(content)

@@ -1,0 +1,192 @@
+"""Commands that talk to what runs: operate, watch, object, lift, params, fault."""
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from dbc.errors import SetupFailure
+from gateway.telemetry import DEFAULT_BASE_PORT
+from xil.cli_common import JsonOption, PortOption, as_json_text, run_daemon, show, stop_on_signal
+
+live = typer.Typer()
+params = typer.Typer(help="Look at and change the parameters of a running controller.", no_args_is_help=True)
+live.add_typer(params, name="params")
+fault = typer.Typer(help="Inject faults into a running emulator, look at them and take them back.", no_args_is_help=True)
+live.add_typer(fault, name="fault")
+
+
+class OperationName(StrEnum):
+    """What an operator can ask for."""
+
+    ENGAGE = "engage"
+    DISENGAGE = "disengage"
+    RESET = "reset"
+
+
+class Movement(StrEnum):
+    """What a lift can do."""
+
+    RAISE = "raise"
+    LOWER = "lower"
+
+
+@live.command()
+def operate(
+    operation: Annotated[OperationName, typer.Argument(help="what to ask of the gateway")],
+    gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
+) -> None:
+    """Ask a running gateway to engage, disengage or reset; `xilgate watch` shows what it makes of it."""
+    from gateway.channel import Channel  # noqa: PLC0415
+    from gateway.messages import Operation, OperatorRequest  # noqa: PLC0415
+    from gateway.telemetry import new_boot_id  # noqa: PLC0415
+
+    with Channel(None, gateway_socket) as channel:
+        channel.send(OperatorRequest(new_boot_id(), 1, Operation[operation.name]))
+        if channel.unsent:
+            raise SetupFailure(f"no gateway listens on {gateway_socket}")
+
+
+@live.command()
+def watch(telemetry_port: PortOption = DEFAULT_BASE_PORT) -> None:
+    """A live table of what runs."""
+    run_daemon("visualiser.watch", lambda m: m.WatchOptions(telemetry_base_port=telemetry_port))
+
+
+@live.command("object")
+def object_from_outside(
+    name: Annotated[str, typer.Argument(help="by which the object is known again")],
+    *,
+    x_m: Annotated[float, typer.Option("--x-m", help="centre, in the local frame")],
+    y_m: Annotated[float, typer.Option("--y-m", help="centre, in the local frame")],
+    heading_deg: Annotated[float, typer.Option("--heading-deg", help="counter-clockwise from x")] = 0.0,
+    speed_kmh: Annotated[float, typer.Option("--speed-kmh", help="along its heading")] = 0.0,
+    kind: Annotated[str, typer.Option("--kind", help="car, adult, child or cyclist: gives the size")] = "car",
+    length_m: Annotated[float | None, typer.Option("--length-m", help="default: by the kind")] = None,
+    width_m: Annotated[float | None, typer.Option("--width-m", help="default: by the kind")] = None,
+    seconds: Annotated[float, typer.Option("--seconds", min=0.1, help="time after which it goes; an interrupt ends it too")] = 600.0,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+) -> None:
+    """Put an object in the car's way while a run goes on whose scenario has none."""
+    from xil.objects import OutsideObject, publish  # noqa: PLC0415
+
+    thing = OutsideObject(name, x_m, y_m, heading_deg, speed_kmh, kind, length_m, width_m)
+    with stop_on_signal() as stop:
+        publish(thing, telemetry_port, seconds, stop)
+
+
+@live.command()
+def lift(
+    movement: Annotated[Movement, typer.Argument(help="what the lift is to do")], telemetry_port: PortOption = DEFAULT_BASE_PORT
+) -> None:
+    """Raise or lower the car of a running emulator; refused unless its wheels stand, its engine idles and its robots are off."""
+    from xil import lift as hoist  # noqa: PLC0415
+
+    print(hoist.move(movement.value, telemetry_port))
+
+
+@params.command("list")
+def params_list(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """All parameters with value, unit, range and default."""
+    params_get([], telemetry_port, as_json)
+
+
+@params.command("get")
+def params_get(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="parameters; `params list` has them all")],
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Some parameters."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.values(names, telemetry_port)
+    show(answer if as_json else tuner.values_table(answer), as_json)
+
+
+@params.command("set")
+def params_set(
+    assignments: Annotated[list[str], typer.Argument(metavar="NAME=VALUE...", help="for example planner.safe_time_s=1.8")],
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Change parameters between two cycles: all that are named, or none when one is refused."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.change(assignments, telemetry_port)
+    show(answer if as_json else tuner.changes_table(answer), as_json)
+
+
+@params.command("revert")
+def params_revert(
+    what: Annotated[str, typer.Argument(help="number of a change, last or all")] = "last",
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a change back: the parameters that it set get the values from before."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.revert(what, telemetry_port)
+    show(answer if as_json else tuner.changes_table(answer), as_json)
+
+
+@params.command("history")
+def params_history(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """Who changed what, and when."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    answer = tuner.history(telemetry_port)
+    show(answer if as_json else tuner.history_table(answer), as_json)
+
+
+@params.command("watch")
+def params_watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """Print every change as it comes in force, until interrupted."""
+    from xil import params as tuner  # noqa: PLC0415
+
+    with stop_on_signal() as stop:
+        tuner.follow(telemetry_port, stop, lambda sample: print(as_json_text(sample) if as_json else tuner.line(sample), flush=True))
+
+
+@fault.command("add")
+def fault_add(
+    kind: Annotated[str, typer.Argument(help="kind of fault; `fault kinds` has them all")],
+    assignments: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE...", help="as in messages=SR_Status duration_s=2")] = None,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Inject a fault; its times count from now."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    answer = injector.add(kind, assignments or [], telemetry_port)
+    show(answer if as_json else injector.table(answer, "added"), as_json)
+
+
+@fault.command("list")
+def fault_list(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+    """All faults of the emulator: waiting, active and over."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    answer = injector.listing(telemetry_port)
+    show(answer if as_json else injector.table(answer, "faults"), as_json)
+
+
+@fault.command("clear")
+def fault_clear(
+    name: Annotated[str | None, typer.Argument(help="name of a fault; default: all")] = None,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    as_json: JsonOption = False,
+) -> None:
+    """Take a fault back, or all."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    answer = injector.clear(name, telemetry_port)
+    show(answer if as_json else injector.table(answer, "cleared"), as_json)
+
+
+@fault.command("kinds")
+def fault_kinds(as_json: JsonOption = False) -> None:
+    """What can go wrong, and the keys of each kind."""
+    from xil import fault as injector  # noqa: PLC0415
+
+    show(injector.kinds_data() if as_json else injector.kinds_table(), as_json)
