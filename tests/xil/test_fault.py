@@ -195,7 +195,9 @@ def test_a_record_tells_every_time_for_which_a_fault_was_there():
     for seq, (name, event, t_s, hits) in enumerate(told):
         recording.add(FaultSample(t_ns=START_NS + round(t_s * 1e9), seq=seq, name=name, what=name, event=event, hits=hits))
     assert injected_faults(recording) == [
-        InjectedFault("gust", "gust", 1.0, 3.0, 0), InjectedFault("drop", "drop", 2.0, 5.0, 7), InjectedFault("gust", "gust", 4.0, None, None),
+        InjectedFault("gust", "gust", 1.0, 3.0, 0),
+        InjectedFault("drop", "drop", 2.0, 5.0, 7),
+        InjectedFault("gust", "gust", 4.0, None, None),
     ]  # fmt: skip
 
 
