@@ -1,25 +1,26 @@
 """The part of the vehicle file that describes the emulated car as bodies, springs, tyres, brakes and steering.
 
 Front and rear are axles of two equal wheels. "Wheel rate" is a stiffness felt at the wheel, along its travel.
+Ranges hold every road car, and shut out what would fly apart in a step of 1 ms.
 """
 
 from typing import Annotated
 
 from pydantic import Field
 
-from dbc.section import NotNegative, Positive, Section, Share
+from dbc.section import NotNegative, Positive, Section, Share, between
 
 
 class Masses(Section):
     """The whole car as it is driven, and the moments of inertia of its sprung body about that body's centre of gravity."""
 
-    mass_kg: Positive
-    cog_to_front_m: Positive
-    cog_to_rear_m: Positive
-    cog_height_m: Positive
-    sprung_roll_inertia_kgm2: Positive
-    sprung_pitch_inertia_kgm2: Positive
-    sprung_yaw_inertia_kgm2: Positive
+    mass_kg: Annotated[float, between(100, 60000)]
+    cog_to_front_m: Annotated[float, between(0.2, 10)]
+    cog_to_rear_m: Annotated[float, between(0.2, 10)]
+    cog_height_m: Annotated[float, between(0.05, 3)]
+    sprung_roll_inertia_kgm2: Annotated[float, between(10, 1e6)]
+    sprung_pitch_inertia_kgm2: Annotated[float, between(10, 1e6)]
+    sprung_yaw_inertia_kgm2: Annotated[float, between(10, 1e6)]
 
 
 class Axle(Section):
@@ -38,10 +39,10 @@ class Axle(Section):
         bearing_nms: drag of bearing and shaft.
     """
 
-    track_m: Positive
-    wheel_kg: Positive
-    wheel_inertia_kgm2: Positive
-    spring_npm: Positive
+    track_m: Annotated[float, between(0.5, 4)]
+    wheel_kg: Annotated[float, between(1, 500)]
+    wheel_inertia_kgm2: Annotated[float, between(0.05, 100)]
+    spring_npm: Annotated[float, between(1000, 1e6)]
     anti_roll_npm: NotNegative
     bump_nspm: NotNegative
     rebound_nspm: NotNegative
@@ -110,8 +111,8 @@ class Tyre(Section):
         rolling_resistance: moment over load and radius.
     """
 
-    radius_m: Positive
-    stiffness_npm: Positive
+    radius_m: Annotated[float, between(0.1, 1)]
+    stiffness_npm: Annotated[float, between(20000, 5e6)]
     damping_nspm: NotNegative
     friction: Positive
     relaxation_x_m: Positive
@@ -157,7 +158,7 @@ class SteeringColumn(Section):
         stop_nmprad2: torque of the end stop per squared way into it.
     """
 
-    inertia_kgm2: Positive
+    inertia_kgm2: Annotated[float, between(0.005, 5)]
     friction_nm: NotNegative
     ackermann_share: Share
     mechanical_trail_m: float
@@ -173,7 +174,7 @@ class MultibodyParameters(Section):
         front_drive_share: share of the drive torque on the front axle: 1 front-driven, 0 rear-driven.
     """
 
-    drag_area_m2: NotNegative
+    drag_area_m2: Annotated[float, between(0.0, 30.0)]
     front_drive_share: Share
     masses: Masses
     front: Axle

@@ -1,11 +1,13 @@
 """The heart of the emulator: one millisecond of the car, from the gateway's frames to the frames of all that answers it."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from random import Random
 
 from dbc.catalogue import Catalogue, CatalogueError
 from dbc.e2e import E2EProtector
+from dbc.errors import UserMistake
 from dbc.frame import CanFrame
 from dbc.vehicle import Vehicle
 from vehicle_emulator import car_bus, ins
@@ -74,6 +76,10 @@ class GroundTruth:
     is_lifted: bool = False
 
 
+class PlantLost(UserMistake):
+    """The emulated car left the realm of numbers; one line that says whose it is."""
+
+
 class Emulator:
     """The car on its buses: every message of the DBC that the gateway does not send.
 
@@ -98,6 +104,7 @@ class Emulator:
     def __init__(self, setup: EmulatorSetup, catalogue: Catalogue, start_ns: int, progress: Progress = silent) -> None:
         _check(catalogue)
         vehicle, start = setup.vehicle, setup.start
+        self._name = vehicle.name
         self._road = _SlipperyRoad(make_road(setup.road))
         pose = (start.x_m, start.y_m, start.yaw_rad)
         plant = make_plant(setup.plant, vehicle, self._road, pose, speed_mps=start.speed_mps, progress=progress)
@@ -126,7 +133,7 @@ class Emulator:
         heard = self.faults.incoming(now_ns, list(frames))
         inputs = robots.step(now_ns, heard, before, driver)
         self.inputs = inputs if faults.plant == inputs.faults else inputs._replace(faults=faults.plant)
-        self._ins.observe(self.car.step(STEP_S, self.inputs))
+        self._ins.observe(self._checked(self.car.step(STEP_S, self.inputs)))
         return self.faults.outgoing(now_ns, [self._senders[name].frame(now_ns, values) for name, values in self._due(now_ns)])
 
     def _suffer(self, faults: ActiveFaults) -> None:
@@ -134,6 +141,12 @@ class Emulator:
         self._active = faults
         self._road.factor, self._ins.faults, self.disturbances = faults.friction, faults.ins, faults.disturbances
         self._robots.faults.update(faults.robots)
+
+    def _checked(self, state: PlantState) -> PlantState:
+        """The state, if it is one: numbers of a vehicle file can be allowed each, and still be no car together."""
+        if not math.isfinite(state.x_m + state.y_m + state.vx_mps + state.yaw_rate_radps):
+            raise PlantLost(f"vehicle {self._name}: the emulated car has no finite state any more; its numbers do not make a car")
+        return state
 
     def truth(self) -> GroundTruth:
         """The state reached by the last step."""

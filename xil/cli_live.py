@@ -72,6 +72,7 @@ def object_from_outside(
 
     thing = OutsideObject(name, x_m, y_m, heading_deg, speed_kmh, kind, length_m, width_m)
     with stop_on_signal() as stop:
+        print(f"{name} is on the road for {seconds:g} s; an interrupt takes it away", flush=True)
         publish(thing, telemetry_port, seconds, stop)
 
 

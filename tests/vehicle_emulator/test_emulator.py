@@ -12,7 +12,7 @@ from dbc.e2e import E2EReceiver, E2EStatus
 from dbc.frame import CanFrame
 from dbc.vehicle import load_vehicle
 from tests.vehicle_emulator.gateway_stub import GatewayStub
-from vehicle_emulator.emulator import STEP_NS, Emulator, EmulatorSetup, GroundTruth, StartPose
+from vehicle_emulator.emulator import STEP_NS, Emulator, EmulatorSetup, GroundTruth, PlantLost, StartPose
 from vehicle_emulator.faults.spec import parse_faults
 from vehicle_emulator.road import RoadDescription
 
@@ -265,3 +265,10 @@ def test_a_car_that_is_disarmed_does_not_creep_away_and_is_handed_over_to_the_ro
     assert again.ar_position_norm == pytest.approx(0.2, abs=0.01)  # nobody has taken over
     assert again.state.vx_mps > 1.0
     assert car.inputs.brake_norm == 0.0
+
+
+def test_a_car_that_flies_apart_is_one_line():
+    axle = VEHICLE.multibody.front.model_copy(update={"spring_npm": 1e10})
+    vehicle = VEHICLE.model_copy(update={"multibody": VEHICLE.multibody.model_copy(update={"front": axle})})
+    with pytest.raises(PlantLost, match=r"^vehicle focus: the emulated car has no finite state any more; its numbers do not make a car$"):
+        run(Emulator(EmulatorSetup(vehicle), CATALOGUE, 0), 200)

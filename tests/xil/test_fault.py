@@ -198,7 +198,7 @@ def test_a_record_tells_every_time_for_which_a_fault_was_there():
         InjectedFault("gust", "gust", 1.0, 3.0, 0),
         InjectedFault("drop", "drop", 2.0, 5.0, 7),
         InjectedFault("gust", "gust", 4.0, None, None),
-    ]  # fmt: skip
+    ]
 
 
 class Loop:

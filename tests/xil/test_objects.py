@@ -45,7 +45,7 @@ def test_an_object_is_published_until_it_is_stopped():
             output, _ = process.communicate(timeout=20)
         finally:
             end(process)
-    assert (process.returncode, output) == (0, "")
+    assert (process.returncode, output) == (0, "wall is on the road for 600 s; an interrupt takes it away\n")
     assert {thing.name for sample in seen for thing in sample.objects} == {"wall"}
     (thing,) = seen[-1].objects
     assert (thing.x_m, thing.y_m, thing.width_m) == (30.0, 1.5, 0.5)

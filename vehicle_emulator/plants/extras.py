@@ -22,5 +22,5 @@ def optional(module: str, extra: str) -> Any:  # noqa: ANN401 - neither library 
     except ModuleNotFoundError as error:
         if error.name != library:
             raise
-        raise ExtraMissing(f"this plant needs the library {library}: pip install 'xilgate[{extra}]'") from error
+        raise ExtraMissing(f"this plant needs the library {library}: .venv/bin/pip install '.[{extra}]'") from error
     return importlib.import_module(module)

@@ -8,7 +8,7 @@ from dbc.vehicle import Vehicle
 from vehicle_emulator.plants.bicycle import GEARS
 from vehicle_emulator.plants.column import SteeringWheel
 from vehicle_emulator.plants.fmu_mapping import WHEEL_LOADS, WHEEL_SPEEDS, FmuMapping, MappingError, Variables, load_mapping
-from vehicle_emulator.plants.fmu_slave import FmuFailed, FmuSlave
+from vehicle_emulator.plants.fmu_slave import FmuFailed, FmuSlave, FmuUnusable
 from vehicle_emulator.plants.interface import PlantInputs, PlantState, Road, RoadPoint, Wheels
 
 PERIOD_S = 1e-3
@@ -42,6 +42,8 @@ class FmuPlant:
         *,
         mapping: Path | None = None,
     ) -> None:
+        if not path.is_file():
+            raise FmuUnusable(f"{path}: no such file")
         mapping_path = mapping or path.with_suffix(".toml")
         content = load_mapping(mapping_path)
         self._vehicle = vehicle

@@ -92,5 +92,5 @@ def test_a_road_that_it_does_not_know_is_refused(description):
 
 def test_without_the_library_it_is_told_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "vehiclemodels", None)
-    with pytest.raises(ExtraMissing, match=r"the library vehiclemodels: pip install 'xilgate\[commonroad\]'"):
+    with pytest.raises(ExtraMissing, match=r"the library vehiclemodels: .venv/bin/pip install '\.\[commonroad\]'"):
         CommonroadPlant(VEHICLE, Level())

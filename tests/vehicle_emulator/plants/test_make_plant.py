@@ -36,5 +36,5 @@ def test_another_name_is_refused_with_the_choices(name):
 
 
 def test_an_fmu_is_named_by_its_file(tmp_path):
-    with pytest.raises(UserMistake, match=r"car\.toml: No such file"):
+    with pytest.raises(UserMistake, match=r"car\.fmu: no such file"):
         made(f"fmu:{tmp_path / 'car.fmu'}")
