@@ -6,7 +6,8 @@ not do: a gateway that repeats what it heard, or a frame that a bus delivers twi
 
 QUESTIONS = 256
 
-_KEY = 0xA5
+_KEY = 0xA7
+"""With an odd number of bits no question is its own answer: a rotation keeps the number of bits."""
 
 
 def answer(question: int) -> int:
