@@ -1,25 +1,29 @@
 """The controller process: the NMPC between the gateway's states and its own commands, 25 times a second. Start reading here."""
 
+import contextlib
 import logging
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from controller.inbox import ObjectInbox
+from controller.journal import RecordedNmpc
 from controller.nmpc import DRIVE_MODEL, Nmpc, NmpcOptions
 from controller.objects import nearest
 from controller.parameters import ParameterStore
 from controller.planning.reference import ReferencePath
 from controller.problem import OcpOptions
+from controller.record import controller_session, record_in
 from controller.samples import Circumstances, ProfileMeter, command_sample, parameters_sample, plan_sample
 from controller.solver import Solver
 from controller.solvers import DEFAULT_SOLVER, make_solver
 from controller.tuning import SERVICE, TuningService
 from dbc.realtime import CONTROLLER_PRIORITY, become_realtime
 from dbc.vehicle import Vehicle, load_vehicle
-from gateway.channel import Channel
+from gateway.channel import Channel, ControlPath
 from gateway.loop import PeriodicLoop
 from gateway.messages import PLAN_PERIOD_NS, CommandStatus, Mode, VehicleState
 from gateway.telemetry import DEFAULT_BASE_PORT, Publisher, Source, new_boot_id
@@ -37,25 +41,27 @@ class ControllerOptions:
 
     Args:
         reference_csv: path to follow, see `reference.ReferencePath.from_csv`.
-        gateway_socket, controller_socket: paths of the two ends of the control path.
+        control: where the gateway is found.
         solver: name in `solvers.SOLVERS`.
+        journal: directory of the journal, None for none.
     """
 
     reference_csv: Path
     vehicle_path: Path
-    gateway_socket: str
-    controller_socket: str
+    control: ControlPath
     solver: str = DEFAULT_SOLVER
     telemetry_base_port: int = DEFAULT_BASE_PORT
+    journal: Path | None = None
 
 
 def run(options: ControllerOptions, stop: threading.Event) -> None:
     """Run the controller until `stop` is set.
 
     Raises:
-        UserMistake: path, vehicle file or solver name are not usable.
+        UserMistake: path, vehicle file, key file or solver name are not usable.
         SetupFailure: no compiler, or a socket or port that cannot be opened.
     """
+    key = options.control.key()
     path = ReferencePath.from_csv(options.reference_csv)
     vehicle = load_vehicle(options.vehicle_path)
     ocp, numbers = OcpOptions(model=DRIVE_MODEL), NmpcOptions(deadline_ns=PLAN_PERIOD_NS)
@@ -65,15 +71,28 @@ def run(options: ControllerOptions, stop: threading.Event) -> None:
     with (
         Publisher(Source.CONTROLLER, options.telemetry_base_port) as telemetry,
         ObjectInbox(options.telemetry_base_port) as inbox,
-        Channel(options.controller_socket, options.gateway_socket) as channel,
+        Channel(options.control.controller_socket, options.control.gateway_socket, key) as channel,
+        _nmpc(options, solver, path, vehicle, numbers) as nmpc,
     ):
         telemetry.serve(SERVICE, TuningService(store).answer)
-        cycle = ControlCycle(Nmpc(solver, path, vehicle, new_boot_id(), numbers), solver.name, channel, telemetry, store=store, inbox=inbox)
+        cycle = ControlCycle(nmpc, solver.name, channel, telemetry, store=store, inbox=inbox)
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         become_realtime(CONTROLLER_PRIORITY)
         loop = PeriodicLoop(PLAN_PERIOD_NS)
         while not stop.is_set():
             cycle.step(loop.wait())
+
+
+@contextlib.contextmanager
+def _nmpc(options: ControllerOptions, solver: Solver, path: ReferencePath, vehicle: Vehicle, numbers: NmpcOptions) -> Iterator[Nmpc]:
+    """The controller, recorded where that is asked for."""
+    boot_id = new_boot_id()
+    if options.journal is None:
+        yield Nmpc(solver, path, vehicle, boot_id, numbers)
+        return
+    session = controller_session(boot_id, options.solver, numbers.deadline_ns, options.reference_csv, options.vehicle_path)
+    with record_in(options.journal, session) as keep:
+        yield RecordedNmpc(solver, path, vehicle, boot_id, numbers, keep=keep)
 
 
 class ControlCycle:

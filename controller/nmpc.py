@@ -74,6 +74,11 @@ class Solution:
         return lateral_offset(self.start, self.horizon)
 
     @property
+    def heading_error_rad(self) -> float:
+        """From the path's heading, counter-clockwise [rad]."""
+        return math.remainder(float(self.start[2] - self.horizon.reference[0, 2]), 2.0 * math.pi)
+
+    @property
     def speed_error_mps(self) -> float:
         """Above the reference speed [m/s]."""
         return float(self.start[0] - self.horizon.reference[0, 0])
@@ -213,6 +218,7 @@ class Nmpc:
         solve_time_ns = 0 if solution is None else solution.result.solve_time_ns
         command = ControlCommand(
             self._boot_id, self._seq, state.seq, now_ns, status, solve_time_ns,
+            0.0 if solution is None else solution.lateral_error_m, 0.0 if solution is None else solution.heading_error_rad,
             steer_rad[0], drive_norm[0], tuple(steer_rad), tuple(drive_norm),
         )  # fmt: skip
         return NmpcOutput(command, plan, solution, self._estimator.disturbance_mps2)

@@ -2,7 +2,7 @@
 
 The DBC is the source of truth. Cycle time, timeout and end-to-end protection come from its attributes
 `GenMsgCycleTime`, `GenMsgTimeout`, `E2EProfile` and `E2EDataId`; the bus on which the messages of a file travel, and its bit
-rate, from `BusName` and `Baudrate`.
+rate, from `BusName` and `Baudrate`. A site whose DBC has names and units of its own maps them to ours in one TOML file.
 """
 
 import hashlib
@@ -11,15 +11,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cantools
-from cantools.database.can.database import Database
 from cantools.database.can.message import Message
-from cantools.database.errors import Error as CantoolsError
 
-from dbc.e2e import COUNTER_START_BIT, CRC_START_BIT, PROFILE
-from dbc.errors import UserMistake
+from dbc.database import NAVIGATION, NETWORKS, ROBOTS, CatalogueError, DbcFile, attributes_of, bitrates, read_dbc
+from dbc.e2e import COUNTER_BITS, COUNTER_START_BIT, CRC_BITS, CRC_START_BIT, PROFILE, tells_stuck_bits
 from dbc.frame import CanFrame
-from dbc.packing import DecodeError, EncodeError, Packing, packing_of
+from dbc.mapping import apply_mapping
+from dbc.packing import DecodeError, EncodeError, Packing, bits_of, packing_of
 
 __all__ = [
     "GNSS_IMU_DBC",
@@ -33,23 +31,23 @@ __all__ = [
     "EncodeError",
     "MessageSpec",
     "load",
+    "read_files",
+    "spec_of",
 ]
 
 ROBOTS_DBC = Path(__file__).with_name("robots.dbc")
 GNSS_IMU_DBC = Path(__file__).with_name("gnss_imu.dbc")
 
-ROBOTS, NAVIGATION = NETWORKS = ("robots", "navigation")
-"""The buses of a car with driving robots: what `BusName` of a DBC file may say."""
+MAX_LENGTH_BYTES = 8
+"""Payload of a classical frame."""
 
-_DEFAULT_BITRATE_BPS = 500_000
-_MAX_BITRATE_BPS = 1_000_000
+E2E_SIGNALS = {
+    "Crc": list(range(CRC_START_BIT, CRC_START_BIT + CRC_BITS)),
+    "AliveCounter": list(range(COUNTER_START_BIT, COUNTER_START_BIT + COUNTER_BITS)),
+}
+"""Signals of a protected message, and the bits that the profile gives them."""
+
 _NS_PER_MS = 1_000_000
-_CRC_SIGNAL = "Crc"
-_COUNTER_SIGNAL = "AliveCounter"
-
-
-class CatalogueError(UserMistake):
-    """A DBC file cannot be used; the text names the file and the message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,30 +75,38 @@ class MessageSpec:
 class Catalogue:
     """All messages of a set of DBC files, by name and by arbitration id.
 
-    Args:
-        messages: each with the network that it travels on.
+    Attributes:
+        sha256: hash of every file that it is made from, by its name.
         bitrate_bps: of every network [bit/s].
+
+    Raises:
+        CatalogueError: a message cannot be used; the text names it and its file.
     """
 
-    def __init__(self, messages: Iterable[tuple[Message, str]], sha256: Mapping[str, str], bitrate_bps: Mapping[str, int]) -> None:
-        self.sha256 = dict(sha256)
-        self.bitrate_bps = dict(bitrate_bps)
+    def __init__(self, files: Iterable[DbcFile]) -> None:
+        files = list(files)
+        self.sha256 = {file.path.name: file.sha256 for file in files}
+        self.bitrate_bps = bitrates(files)
         self._messages: dict[str, Message] = {}
         self._packings: dict[str, Packing] = {}
         self._signals: dict[str, dict[str, None]] = {}
         self.by_name: dict[str, MessageSpec] = {}
         self.by_id: dict[int, MessageSpec] = {}
-        for message, network in messages:
-            self._add(message, network)
+        for file in files:
+            for message in file.messages:
+                self._add(message, file)
 
-    def _add(self, message: Message, network: str) -> None:
-        spec = _spec_of(message, network)
-        if spec.name in self.by_name or spec.arbitration_id in self.by_id:
-            raise CatalogueError(f"message {spec.name} (id 0x{spec.arbitration_id:X}) is defined twice")
+    def _add(self, message: Message, file: DbcFile) -> None:
+        try:
+            spec = spec_of(message, file.network)
+            if spec.name in self.by_name or spec.arbitration_id in self.by_id:
+                raise CatalogueError(f"message {spec.name} (id 0x{spec.arbitration_id:X}) is defined twice")
+            self._packings[spec.name] = packing_of(message)
+        except (CatalogueError, EncodeError) as error:
+            raise CatalogueError(f"{file.path}: {error}") from error
         self.by_name[spec.name] = spec
         self.by_id[spec.arbitration_id] = spec
         self._messages[spec.name] = message
-        self._packings[spec.name] = packing_of(message)
         self._signals[spec.name] = dict.fromkeys(signal.name for signal in message.signals)
 
     def require(self, names: Iterable[str], user: str) -> None:
@@ -156,65 +162,77 @@ class Catalogue:
         return self._packings[spec.name].unpack(frame.data)
 
 
-def load(paths: Iterable[Path] = (ROBOTS_DBC, GNSS_IMU_DBC)) -> Catalogue:
-    """Read DBC files into one catalogue.
+def load(paths: Iterable[Path] = (ROBOTS_DBC, GNSS_IMU_DBC), mapping: Path | None = None) -> Catalogue:
+    """The catalogue of these DBC files.
+
+    Args:
+        mapping: TOML file that says which names and units of the files are ours, see `dbc.mapping`; None when all are.
 
     Raises:
-        CatalogueError: a file is missing, does not parse, or clashes with another.
+        CatalogueError: a file is missing or malformed, or one identifier, name or bus is defined twice.
     """
-    messages: list[tuple[Message, str]] = []
-    sha256: dict[str, str] = {}
-    bitrate_bps: dict[str, int] = {}
-    for path in paths:
-        try:
-            content = path.read_bytes()
-            database = cantools.database.load_string(content.decode("latin-1"), database_format="dbc")
-        except OSError as error:
-            raise CatalogueError(f"{path}: {error.strerror or error}") from error
-        except (CantoolsError, ValueError) as error:
-            raise CatalogueError(f"{path}: not a usable DBC: {' '.join(str(error).split())}") from error
-        network, rate_bps = _network_of(path, database)  # type: ignore[arg-type]
-        if bitrate_bps.setdefault(network, rate_bps) != rate_bps:
-            raise CatalogueError(f"{path}: Baudrate {rate_bps}: another file gives bus {network} {bitrate_bps[network]} bit/s")
-        messages += [(message, network) for message in database.messages]  # type: ignore[union-attr]
-        sha256[path.name] = hashlib.sha256(content).hexdigest()
-    return Catalogue(messages, sha256, dict.fromkeys(NETWORKS, _DEFAULT_BITRATE_BPS) | bitrate_bps)
+    catalogue = Catalogue(read_files(paths, mapping))
+    if mapping is not None:
+        catalogue.sha256[mapping.name] = hashlib.sha256(mapping.read_bytes()).hexdigest()
+    return catalogue
 
 
-def _network_of(path: Path, database: Database) -> tuple[str, int]:
-    """The bus that a file is about, and its bit rate; a file that names none is about the robots' bus, as one for everything is."""
-    stated: dict[str, object] = {}
-    if database.dbc is not None:
-        stated = {name: definition.default_value for name, definition in database.dbc.attribute_definitions.items()}
-        stated |= {name: attribute.value for name, attribute in database.dbc.attributes.items()}
-    network, bitrate_bps = stated.get("BusName") or ROBOTS, stated.get("Baudrate") or _DEFAULT_BITRATE_BPS
-    if not (isinstance(network, str) and network in NETWORKS):
-        raise CatalogueError(f"{path}: BusName {network!r}: expected {' or '.join(NETWORKS)}")
-    if not (isinstance(bitrate_bps, int) and 0 < bitrate_bps <= _MAX_BITRATE_BPS):
-        raise CatalogueError(f"{path}: Baudrate {bitrate_bps} outside [1, {_MAX_BITRATE_BPS}]")
-    return network, bitrate_bps
+def read_files(paths: Iterable[Path], mapping: Path | None = None, is_strict: bool = True) -> list[DbcFile]:
+    """These DBC files as they are, or under our names.
+
+    Args:
+        mapping: as for `load`.
+        is_strict: whether signals that overlap or reach beyond their message make a file unusable.
+
+    Raises:
+        CatalogueError: a file is missing or malformed, or the mapping does not fit it.
+    """
+    files = [read_dbc(path, is_strict) for path in paths]
+    return files if mapping is None else apply_mapping(mapping, files, [read_dbc(ROBOTS_DBC), read_dbc(GNSS_IMU_DBC)])
 
 
-def _spec_of(message: Message, network: str) -> MessageSpec:
-    attributes = {name: a.value for name, a in message.dbc.attributes.items()} if message.dbc else {}
-    data_id: int | None = None
-    if profile := attributes.get("E2EProfile", ""):
-        if profile != PROFILE:
-            raise CatalogueError(f"message {message.name}: E2EProfile {profile!r} is not supported, only {PROFILE!r}")
-        data_id = int(attributes.get("E2EDataId", 0))
-        # Data id 0 would let an all-zero frame pass the CRC.
-        if not 1 <= data_id <= 255:
-            raise CatalogueError(f"message {message.name}: E2EDataId {data_id} outside [1, 255]")
-        for signal, start in ((_CRC_SIGNAL, CRC_START_BIT), (_COUNTER_SIGNAL, COUNTER_START_BIT)):
-            if not any(s.name == signal and s.start == start for s in message.signals):
-                raise CatalogueError(f"message {message.name}: E2E profile {PROFILE} needs signal {signal} at bit {start}")
+def spec_of(message: Message, network: str) -> MessageSpec:
+    """What a message says of itself.
+
+    Raises:
+        CatalogueError: it cannot be used; the text names it.
+    """
+    if message.is_extended_frame or message.length > MAX_LENGTH_BYTES:
+        raise CatalogueError(f"message {message.name}: only classical frames with an 11-bit identifier and up to 8 bytes are supported")
+    names = [signal.name for signal in message.signals]
+    for signal in message.signals:
+        if names.count(signal.name) > 1 or signal.scale == 0:
+            raise CatalogueError(f"message {message.name}: signal {signal.name} is defined twice or has the factor 0")
+    attributes = attributes_of(message)
     return MessageSpec(
         name=message.name,
         arbitration_id=message.frame_id,
         length_bytes=message.length,
-        cycle_time_ns=int(attributes.get("GenMsgCycleTime", 0)) * _NS_PER_MS,
-        timeout_ns=int(attributes.get("GenMsgTimeout", 0)) * _NS_PER_MS,
+        cycle_time_ns=_whole(message, attributes, "GenMsgCycleTime") * _NS_PER_MS,
+        timeout_ns=_whole(message, attributes, "GenMsgTimeout") * _NS_PER_MS,
         sender=message.senders[0] if message.senders else "",
-        e2e_data_id=data_id,
+        e2e_data_id=_data_id(message, attributes) if attributes.get("E2EProfile") else None,
         network=network,
     )
+
+
+def _data_id(message: Message, attributes: Mapping[str, object]) -> int:
+    if (profile := attributes["E2EProfile"]) != PROFILE:
+        raise CatalogueError(f"message {message.name}: E2EProfile {profile!r} is not supported, only {PROFILE!r}")
+    data_id = _whole(message, attributes, "E2EDataId")
+    if not 1 <= data_id <= 255:
+        raise CatalogueError(f"message {message.name}: E2EDataId {data_id} outside [1, 255]")
+    for name, bits in E2E_SIGNALS.items():
+        if not any(signal.name == name and bits_of(signal) == bits for signal in message.signals):
+            raise CatalogueError(f"message {message.name}: E2E profile {PROFILE} needs signal {name} at bits {bits[0]} to {bits[-1]}")
+    if not tells_stuck_bits(data_id, message.length):
+        raise CatalogueError(f"message {message.name}: E2EDataId {data_id} lets a payload of equal bits pass: allowed: another one")
+    return data_id
+
+
+def _whole(message: Message, attributes: Mapping[str, object], name: str) -> int:
+    """An attribute that counts something; 0 where there is none."""
+    value = attributes.get(name) or 0
+    if not (isinstance(value, int) and value >= 0):
+        raise CatalogueError(f"message {message.name}: {name} {value!r}: allowed: a whole number from 0 on")
+    return value

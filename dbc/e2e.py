@@ -1,11 +1,14 @@
-"""End-to-end protection of CAN payloads: AUTOSAR E2E profile 2.
+"""End-to-end protection of CAN payloads: AUTOSAR E2E profile 2, and the state machine of its receiver.
 
 CRC-8 with polynomial 0x2F in byte 0 and a 4-bit alive counter in the low nibble of byte 1. Profile 2 detects every
 pattern of up to three bit errors in a payload of this length, which profile 1 (polynomial 0x1D) does not.
-The receiver's counter rules follow AUTOSAR's "Specification of SW-C End-to-End Communication Protection Library".
+The receiver's counter rules and its window follow AUTOSAR's "Specification of SW-C End-to-End Communication Protection Library",
+with one difference: how a stream comes to be trusted again is the window's affair alone, for every kind of bad frame, so that the
+profile has no state of its own in which it synchronises again. What has not come at all is not seen here but by its age.
 It detects faults, not attackers.
 """
 
+from dataclasses import dataclass
 from enum import Enum
 from functools import cache
 
@@ -19,7 +22,9 @@ COUNTER_MODULUS = 16
 _COUNTER_BYTE = COUNTER_START_BIT // 8
 _COUNTER_MASK = COUNTER_MODULUS - 1
 MAX_DELTA_COUNTER = 3
-"""Largest counter step that is still a continuous stream: two frames in a row may be lost."""
+"""Largest counter step that is still a continuous stream: two frames in a row may be lost, which is AUTOSAR's MaxDeltaCounterInit of 2."""
+COUNTER_BITS = 4
+CRC_BITS = 8
 
 
 class E2EStatus(Enum):
@@ -65,6 +70,11 @@ def alive_counter(payload: bytes) -> int:
     return payload[_COUNTER_BYTE] & _COUNTER_MASK
 
 
+def tells_stuck_bits(data_id: int, length_bytes: int) -> bool:
+    """Whether a payload of zeros alone, and one of ones alone, fails under this data id; under 232 eight bytes of zeros would pass."""
+    return all(seal(stuck, data_id, alive_counter(stuck)) != stuck for stuck in (bytes(length_bytes), b"\xff" * length_bytes))
+
+
 class E2EProtector:
     """Sender side of one message: writes the next counter and the CRC."""
 
@@ -102,3 +112,83 @@ class E2EReceiver:
         if delta <= self._max_delta_counter:
             return E2EStatus.SOME_LOST
         return E2EStatus.WRONG_SEQUENCE
+
+
+class E2EState(Enum):
+    """Whether the stream of one message can be trusted."""
+
+    INIT = "init"
+    VALID = "valid"
+    INVALID = "invalid"
+
+
+@dataclass(frozen=True, slots=True)
+class WindowRules:
+    """When a stream is trusted.
+
+    Args:
+        size: frames that are looked at, the newest ones.
+        max_bad: of these, bad ones that a stream may have.
+        min_good: good frames in a row that make a stream valid.
+        clean_ns: time for which an invalid stream must also have been without a bad frame and without a gap to be valid again [ns].
+    """
+
+    size: int = 10
+    max_bad: int = 2
+    min_good: int = 3
+    clean_ns: int = 1_000_000_000
+
+
+class E2EWindow:
+    """State machine over the frames of one message, good and bad (E2E_SM of AUTOSAR): Init, Valid, Invalid.
+
+    A bad frame is to be ignored at once, whatever the state is. This is about the frames after it: a stream with more than `max_bad`
+    bad frames in its window is invalid, and then its good frames do not count either until it has been clean for `clean_ns`.
+
+    Args:
+        timeout_ns: age from which the message is missing [ns]; a stream with such a gap between two good frames is not clean.
+    """
+
+    def __init__(self, timeout_ns: int, rules: WindowRules = WindowRules()) -> None:
+        self._timeout_ns = timeout_ns
+        self._rules = rules
+        self._mask = (1 << rules.size) - 1
+        self._bad = 0  # one bit for each frame of the window, set for a bad one
+        self._good = 0
+        self._clean_since_ns = 0
+        self._last_good_ns = 0
+        self.state = E2EState.INIT
+
+    def add(self, now_ns: int, is_good: bool) -> E2EState:
+        """Judge the stream anew with one more frame.
+
+        Args:
+            now_ns: when it arrived [ns].
+            is_good: whether length, protection and ranges were as they must be.
+        """
+        self._bad = (self._bad << 1 | (not is_good)) & self._mask
+        if is_good:
+            self._note_good(now_ns)
+        else:
+            self._good = 0
+        if self.bad_frames > self._rules.max_bad:
+            self.state = E2EState.INVALID
+        elif self._is_trusted(now_ns):
+            self.state = E2EState.VALID
+        return self.state
+
+    @property
+    def bad_frames(self) -> int:
+        """Bad frames in the window."""
+        return self._bad.bit_count()
+
+    def _note_good(self, now_ns: int) -> None:
+        if self._good == 0 or now_ns - self._last_good_ns > self._timeout_ns:
+            self._good = 0
+            self._clean_since_ns = now_ns
+        self._good += 1
+        self._last_good_ns = now_ns
+
+    def _is_trusted(self, now_ns: int) -> bool:
+        wait_ns = self._rules.clean_ns if self.state is E2EState.INVALID else 0
+        return self._good >= self._rules.min_good and now_ns - self._clean_since_ns >= wait_ns

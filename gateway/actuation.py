@@ -1,91 +1,225 @@
-"""From a road-wheel angle and a drive demand to three robots, within the limits."""
+"""From a road-wheel angle and a drive demand to three robots, within the limits.
 
-import math
+Demands are whole numbers of the steps that the bus has, and every rate is judged against the last one: what is on the bus is within the
+limits to the last bit, however long the drive. Bounds give way to rates: a demand outside a bound that has become narrower comes back as
+fast as the rate allows.
+"""
+
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 from dbc.vehicle import Vehicle
-from gateway.limits import Demand, LimitProfile, clamp, limit_rate, steer_bound_rad
+from gateway.limits import (
+    STILL_MPS,
+    Demand,
+    LimitProfile,
+    Resolution,
+    clamp,
+    lateral_acceleration_mps2,
+    road_wheel_rad,
+    steps_down,
+    steps_up,
+    steps_within,
+)
+from gateway.messages import PLAN_PERIOD_NS
 
 BRAKE_RELEASED_NORM = 0.02
 """Brake-pedal position below which the accelerator may move."""
 
 NEUTRAL = Demand(0.0, 0.0, 0.0)
 
+STEERING_ANGLE, STEERING_RATE = "steering angle", "steering rate"
+LATERAL_ACCELERATION, LATERAL_JERK = "lateral acceleration", "lateral jerk"
+ACCELERATION, DECELERATION = "acceleration", "deceleration"
+DRIVE_JERK, BRAKE_JERK = "drive jerk", "brake jerk"
+
+UNITS: Mapping[str, str] = {
+    STEERING_ANGLE: "rad",
+    LATERAL_ACCELERATION: "m/s2",
+    STEERING_RATE: "rad/s",
+    LATERAL_JERK: "m/s3",
+    ACCELERATION: "m/s2",
+    DECELERATION: "m/s2",
+    DRIVE_JERK: "m/s3",
+    BRAKE_JERK: "m/s3",
+}
+"""Every limit, and the unit of its activations; angle and rate are those of the steering wheel."""
+
+_RATES = (STEERING_RATE, LATERAL_JERK, DRIVE_JERK, BRAKE_JERK)
+
+
+@dataclass(frozen=True, slots=True)
+class Activation:
+    """That a limit has changed a demand; numbers in the unit of the limit.
+
+    Args:
+        tick: of the driven ones, counted from 1.
+        asked, limit, given: what came in, what is allowed, what went out.
+    """
+
+    tick: int
+    asked: float
+    limit: float
+    given: float
+
 
 class Actuation:
     """Limits demands and splits them; holds the last one, because rates are limited against it.
 
+    A plan is a staircase, and each of its steps becomes a ramp. So a rate counts as an activation only from the tick on in which the
+    demand has been behind for as long as a step of the plan lasts; a bound counts at once.
+
     Attributes:
         demand: what the robots are asked for now.
-        limited: ticks in which a limit changed the demand, by limit.
+        engaged_ticks: ticks in which demands were limited.
+        limited_ticks: those of them with an activation of any limit.
+        limited: activations by limit, see `UNITS`.
+        last_limited: the newest activation of each limit.
     """
 
-    def __init__(self, vehicle: Vehicle, profile: LimitProfile, tick_ns: int) -> None:
+    def __init__(self, vehicle: Vehicle, profile: LimitProfile, tick_ns: int, resolution: Resolution | None = None) -> None:
         self._vehicle = vehicle
         self._profile = profile
         self._tick_s = tick_ns * 1e-9
+        self._ramp_ticks = PLAN_PERIOD_NS // tick_ns
+        self._resolution = resolution or Resolution()
         self._wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
-        self._brake_gain = vehicle.pedals.full_brake_force_n / vehicle.pedals.full_drive_force_n
-        self._drive_norm = 0.0
+        self._full_drive_mps2 = vehicle.pedals.full_drive_force_n / vehicle.model.mass_kg
+        self._full_brake_mps2 = vehicle.pedals.full_brake_force_n / vehicle.model.mass_kg
+        self._drive_step_mps2 = self._resolution.pedal_norm * self._full_drive_mps2
+        self._brake_step_mps2 = self._resolution.pedal_norm * self._full_brake_mps2
+        self._behind: Counter[str] = Counter()
         self.demand = NEUTRAL
+        self.engaged_ticks = 0
+        self.limited_ticks = 0
         self.limited: Counter[str] = Counter()
+        self.last_limited: dict[str, Activation] = {}
 
     @property
     def steer_rad(self) -> float:
         """Road-wheel angle that is demanded [rad]."""
         return self.demand.steering_wheel_rad / self._vehicle.steering.ratio
 
+    @property
+    def acceleration_mps2(self) -> float:
+        """What the pedals are asked for [m/s2]; negative brakes."""
+        return self.demand.accelerator_norm * self._full_drive_mps2 - self.demand.brake_norm * self._full_brake_mps2
+
     def drive_norm(self, accelerator_norm: float, brake_norm: float) -> float:
         """Drive demand that two pedal positions stand for; the inverse of the split."""
-        return accelerator_norm - brake_norm * self._brake_gain
+        return accelerator_norm - brake_norm * self._full_brake_mps2 / self._full_drive_mps2
 
     def release(self) -> None:
         """Ask for nothing."""
-        self.demand, self._drive_norm = NEUTRAL, 0.0
+        self.demand = NEUTRAL
+        self._behind.clear()
 
     def start_from(self, measured: Demand) -> None:
         """Take over from where the robots are, so that an engagement has no bump."""
-        self.demand = measured
-        self._drive_norm = self.drive_norm(measured.accelerator_norm, measured.brake_norm)
+        step_rad = self._resolution.steering_wheel_rad
+        acceleration_mps2 = measured.accelerator_norm * self._full_drive_mps2 - measured.brake_norm * self._full_brake_mps2
+        pedals = self._split(acceleration_mps2, -self._full_brake_mps2, self._full_drive_mps2)
+        self.demand = Demand(round(measured.steering_wheel_rad / step_rad) * step_rad, *pedals)
+        self._behind.clear()
 
     def hold_still(self) -> None:
         """Keep a standing car standing."""
-        self.demand = Demand(self.demand.steering_wheel_rad, 0.0, self._profile.standstill_brake_norm)
-        self._drive_norm = self.drive_norm(0.0, self._profile.standstill_brake_norm)
+        self._limit(self.demand.steering_wheel_rad, -self._profile.standstill_brake_norm * self._full_brake_mps2, 0.0, 0.0)
 
     def decelerate(self, steer_rad: float, deceleration_mps2: float, vx_mps: float, brake_norm: float) -> None:
         """Steer and slow down; `brake_norm` is the measured pedal."""
-        force_n = self._vehicle.model.mass_kg * deceleration_mps2
-        self.follow(steer_rad, -force_n / self._vehicle.pedals.full_drive_force_n, vx_mps, brake_norm)
+        self._limit(steer_rad * self._vehicle.steering.ratio, -deceleration_mps2, vx_mps, brake_norm)
 
     def follow(self, steer_rad: float, drive_norm: float, vx_mps: float, brake_norm: float) -> None:
         """Follow a command as far as the limits let it; `brake_norm` is the measured pedal."""
-        steering_wheel_rad = self._limit_steering(steer_rad, vx_mps)
-        self._limit_drive(drive_norm)
-        if self._drive_norm < 0.0:
-            self.demand = Demand(steering_wheel_rad, 0.0, -self._drive_norm / self._brake_gain)
-        else:
-            # Interlock: the accelerator waits until the brake pedal has really come back.
-            is_brake_released = brake_norm < BRAKE_RELEASED_NORM
-            self.demand = Demand(steering_wheel_rad, self._drive_norm if is_brake_released else 0.0, 0.0)
+        self._limit(steer_rad * self._vehicle.steering.ratio, drive_norm * self._full_drive_mps2, vx_mps, brake_norm)
 
-    def _limit_steering(self, steer_rad: float, vx_mps: float) -> float:
-        bound_rad = steer_bound_rad(self._profile, self._wheelbase_m, self._vehicle.steering.road_wheel_limit_rad, vx_mps)
-        bounded_rad = clamp(steer_rad, -bound_rad, bound_rad)
-        self._count("steering angle", steer_rad, bounded_rad)
-        wanted_rad = bounded_rad * self._vehicle.steering.ratio
-        step_rad = self._profile.steering_wheel_rate_radps * self._tick_s
-        limited_rad = limit_rate(wanted_rad, self.demand.steering_wheel_rad, step_rad, step_rad)
-        self._count("steering rate", wanted_rad, limited_rad)
-        return limited_rad
+    def _limit(self, steering_wheel_rad: float, acceleration_mps2: float, vx_mps: float, brake_norm: float) -> None:
+        self.engaged_ticks += 1
+        counted = self.limited.total()
+        limited_rad = self._limit_steering(steering_wheel_rad, abs(vx_mps)) * self._resolution.steering_wheel_rad
+        self.demand = Demand(limited_rad, *self._limit_pedals(acceleration_mps2, brake_norm))
+        self.limited_ticks += min(self.limited.total() - counted, 1)
 
-    def _limit_drive(self, drive_norm: float) -> None:
-        wanted_norm = clamp(drive_norm, -self._brake_gain, 1.0)
-        self._count("drive", drive_norm, wanted_norm)
-        rise, fall = self._profile.drive_rate_per_s * self._tick_s, self._profile.brake_rate_per_s * self._tick_s
-        self._drive_norm = limit_rate(wanted_norm, self._drive_norm, rise, fall)
-        self._count("drive rate", wanted_norm, self._drive_norm)
+    def _limit_steering(self, asked_rad: float, speed_mps: float) -> int:
+        """Steering-wheel angle in steps of the bus."""
+        step_rad = self._resolution.steering_wheel_rad
+        before, target = round(self.demand.steering_wheel_rad / step_rad), self._bound_steering(asked_rad, speed_mps)
+        limit_radps = self._profile.steering_wheel_rate_radps
+        reach = limit_radps * self._tick_s / step_rad
+        reached = _approach(before, target, before - reach, before + reach)
+        per_s = step_rad / self._tick_s
+        self._note(STEERING_RATE, (target - before) * per_s, limit_radps, (reached - before) * per_s)
+        return self._limit_lateral_jerk(before, reached, speed_mps) if speed_mps >= STILL_MPS else reached
 
-    def _count(self, name: str, asked: float, given: float) -> None:
-        if not math.isclose(asked, given, abs_tol=1e-9):
+    def _bound_steering(self, asked_rad: float, speed_mps: float) -> int:
+        """The nearest angle that is allowed when time does not count, in steps of the bus."""
+        profile, ratio = self._profile, self._vehicle.steering.ratio
+        end_rad = min(profile.steering_wheel_limit_rad, self._vehicle.steering.road_wheel_limit_rad * ratio)
+        bounded_rad = clamp(asked_rad, -end_rad, end_rad)
+        self._note(STEERING_ANGLE, asked_rad, end_rad, bounded_rad)
+        if speed_mps >= STILL_MPS:
+            limit_mps2, asked_mps2 = profile.lateral_acceleration_mps2, self._lateral_mps2(bounded_rad, speed_mps)
+            given_mps2 = clamp(asked_mps2, -limit_mps2, limit_mps2)
+            self._note(LATERAL_ACCELERATION, asked_mps2, limit_mps2, given_mps2)
+            end_rad = min(end_rad, road_wheel_rad(limit_mps2, self._wheelbase_m, speed_mps) * ratio)
+        return steps_within(bounded_rad, -end_rad, end_rad, self._resolution.steering_wheel_rad)
+
+    def _limit_lateral_jerk(self, before: int, target: int, speed_mps: float) -> int:
+        limit_mps3, step_rad = self._profile.lateral_jerk_mps3, self._resolution.steering_wheel_rad
+        before_mps2, reach_mps2 = self._lateral_mps2(before * step_rad, speed_mps), limit_mps3 * self._tick_s
+        low, high = (
+            road_wheel_rad(bound_mps2, self._wheelbase_m, speed_mps) * self._vehicle.steering.ratio / step_rad
+            for bound_mps2 in (before_mps2 - reach_mps2, before_mps2 + reach_mps2)
+        )
+        reached = _approach(before, target, low, high)
+        asked_mps2, given_mps2 = (self._lateral_mps2(steps * step_rad, speed_mps) for steps in (target, reached))
+        self._note(LATERAL_JERK, (asked_mps2 - before_mps2) / self._tick_s, limit_mps3, (given_mps2 - before_mps2) / self._tick_s)
+        return reached
+
+    def _lateral_mps2(self, steering_wheel_rad: float, speed_mps: float) -> float:
+        return lateral_acceleration_mps2(steering_wheel_rad / self._vehicle.steering.ratio, self._wheelbase_m, speed_mps)
+
+    def _limit_pedals(self, asked_mps2: float, brake_norm: float) -> tuple[float, float]:
+        """Accelerator and brake pedal."""
+        profile, before_mps2 = self._profile, self.acceleration_mps2
+        top_mps2 = min(profile.acceleration_mps2, self._full_drive_mps2)
+        bottom_mps2 = -min(profile.deceleration_mps2, self._full_brake_mps2)
+        driven_mps2 = min(asked_mps2, top_mps2)
+        self._note(ACCELERATION, asked_mps2, top_mps2, driven_mps2)
+        target_mps2 = max(driven_mps2, bottom_mps2)
+        self._note(DECELERATION, driven_mps2, bottom_mps2, target_mps2)
+        high_mps2 = before_mps2 + profile.drive_jerk_mps3 * self._tick_s
+        low_mps2 = min(before_mps2, 0.0) - profile.brake_jerk_mps3 * self._tick_s
+        for name, limit_mps3, reached_mps2 in (
+            (DRIVE_JERK, profile.drive_jerk_mps3, min(target_mps2, high_mps2)),
+            (BRAKE_JERK, -profile.brake_jerk_mps3, max(target_mps2, low_mps2)),
+        ):
+            self._note(name, (target_mps2 - before_mps2) / self._tick_s, limit_mps3, (reached_mps2 - before_mps2) / self._tick_s)
+        if bottom_mps2 + self._brake_step_mps2 <= high_mps2:
+            low_mps2, high_mps2 = max(low_mps2, bottom_mps2), min(high_mps2, top_mps2)
+        accelerator_norm, limited_brake_norm = self._split(clamp(target_mps2, low_mps2, high_mps2), low_mps2, high_mps2)
+        # Interlock: the accelerator waits until the brake pedal has really come back.
+        return accelerator_norm if brake_norm < BRAKE_RELEASED_NORM else 0.0, limited_brake_norm
+
+    def _split(self, acceleration_mps2: float, low_mps2: float, high_mps2: float) -> tuple[float, float]:
+        """Accelerator or brake for an acceleration, on steps of the bus within [low, high]."""
+        if acceleration_mps2 >= 0.0:
+            return steps_within(acceleration_mps2, low_mps2, high_mps2, self._drive_step_mps2) * self._resolution.pedal_norm, 0.0
+        return 0.0, steps_within(-acceleration_mps2, -high_mps2, -low_mps2, self._brake_step_mps2) * self._resolution.pedal_norm
+
+    def _note(self, name: str, asked: float, limit: float, given: float) -> None:
+        """Keep account of a limit in this tick."""
+        if asked == given:
+            self._behind[name] = 0
+            return
+        self._behind[name] += 1
+        if name not in _RATES or self._behind[name] >= self._ramp_ticks:
             self.limited[name] += 1
+            self.last_limited[name] = Activation(self.engaged_ticks, asked, limit, given)
+
+
+def _approach(before: int, target: int, low: float, high: float) -> int:
+    """As far from `before` to `target` as [low, high] allows, in steps of the bus; one step is always allowed."""
+    return min(max(target, min(steps_up(low, 1.0), before - 1)), max(steps_down(high, 1.0), before + 1))

@@ -1,75 +1,56 @@
 """The gateway process: the core between the car's buses, the controller's socket and telemetry, 100 times a second. Start here."""
 
-import logging
-import threading
-import time
-from collections.abc import Mapping
-from dataclasses import dataclass
-from pathlib import Path
+import contextlib
+from collections.abc import Callable
 
-from dbc.catalogue import load
 from dbc.link import BusSet
-from dbc.realtime import GATEWAY_PRIORITY, become_realtime
-from dbc.vehicle import load_vehicle
-from gateway.channel import Channel
-from gateway.core import TICK_NS, GatewayCore
+from gateway.channel import Channel, OperatorServer
+from gateway.core import TICK_NS
+from gateway.cycle import ControlCycle, Links
+from gateway.housekeeping import Housekeeper, Orders, Pulse
+from gateway.logs import LogThread
 from gateway.loop import PeriodicLoop
-from gateway.messages import ControlCommand, OperatorRequest
-from gateway.samples import GatewaySampler, Process
+from gateway.metrics import MetricsServer
+from gateway.practice import realtime_practice
+from gateway.preparation import OWN_NODE, Preparation, start_recorder
+from gateway.systemd import Notifier
 from gateway.telemetry import Publisher, Source, new_boot_id
+from gateway.warm_up import warm_up
 
-log = logging.getLogger("xilgate.gateway")
 
-
-@dataclass(frozen=True)
-class GatewayOptions:
-    """Settings of the process.
+def run(
+    preparation: Preparation, orders: Orders, notifier: Notifier, logs: LogThread, prepare: Callable[[], Preparation] | None = None
+) -> Preparation | None:
+    """Run the gateway until it is asked to end, or to go on with another configuration.
 
     Args:
-        buses: python-can name of the bus of every network, `INTERFACE:CHANNEL`.
-        gateway_socket, controller_socket: paths of the two ends of the control path.
-    """
+        prepare: makes that configuration; None where there is nothing to make it from.
 
-    buses: Mapping[str, str]
-    dbc_paths: tuple[Path, ...]
-    vehicle_path: Path
-    gateway_socket: str
-    controller_socket: str
-    telemetry_base_port: int
-
-
-def run(options: GatewayOptions, stop: threading.Event) -> None:
-    """Run the gateway until `stop` is set.
+    Returns:
+        The configuration to go on with; None when it is over.
 
     Raises:
-        CatalogueError, VehicleError, LinkError, ChannelError, TelemetryError: the set-up is not usable.
+        UserMistake: the key file is not usable.
+        SetupFailure: a bus, socket or port cannot be opened.
     """
-    catalogue = load(options.dbc_paths)
-    core = GatewayCore(catalogue, load_vehicle(options.vehicle_path), new_boot_id())
-    sampler = GatewaySampler()
-    named_dead: set[str] = set()
-    with (
-        Publisher(Source.GATEWAY, options.telemetry_base_port) as telemetry,
-        BusSet(options.buses, catalogue) as buses,
-        Channel(options.gateway_socket, options.controller_socket) as channel,
-    ):
-        if not become_realtime(GATEWAY_PRIORITY):
-            log.warning("no real-time priority: `xilgate doctor` says how to get it")
-        loop = PeriodicLoop(TICK_NS)
-        while not stop.is_set():
-            now_ns = loop.wait()
-            cpu_start_ns = time.thread_time_ns()
-            output = core.step(now_ns, buses.receive(), channel.newest(ControlCommand), channel.newest(OperatorRequest))
-            buses.send(output.frames)
-            channel.send(output.state)
-            cpu_ms = (time.thread_time_ns() - cpu_start_ns) * 1e-6
-            if output.transition is not None:
-                log.info("%s -> %s: %s", output.transition.before.name, output.transition.after.name, output.transition.reason)
-            dead = buses.dead
-            if not stop.is_set():  # at the end of a run its buses go as well
-                # Once each: a bus that refuses now and then would fill the log.
-                for network in set(dead) - named_dead:
-                    named_dead.add(network)
-                    log.warning("bus %s (%s) refuses frames", network, options.buses[network])
-            for sample in sampler.sample(core, output, now_ns, Process(loop.overruns, cpu_ms, dead, buses.dropped)):
-                telemetry.post(sample)
+    rig, boot_id, pulse = preparation.rig, new_boot_id(), Pulse()
+    control = rig.control.path
+    key = control.key()
+    warm_up(preparation)
+    with contextlib.ExitStack() as opened:
+        links = Links(
+            buses=opened.enter_context(BusSet(rig.buses.by_network, preparation.catalogue, OWN_NODE)),
+            channel=opened.enter_context(Channel(control.gateway_socket, control.controller_socket, key)),
+            operators=opened.enter_context(OperatorServer(control.operator_socket, key)),
+            telemetry=opened.enter_context(Publisher(Source.GATEWAY, rig.telemetry.base_port)),
+            recorder=opened.enter_context(start_recorder(preparation, rig.recorder, boot_id)) if rig.recorder is not None else None,
+        )
+        if rig.metrics is not None:
+            opened.enter_context(MetricsServer(rig.metrics.port, pulse, logs))
+        opened.enter_context(Housekeeper(pulse, orders, notifier, rig.daemon.watchdog_s, prepare))
+        pulse.realtime = opened.enter_context(realtime_practice(rig.realtime))
+        cycle = ControlCycle(preparation, boot_id, links, pulse, orders)
+        loop = PeriodicLoop(TICK_NS, pulse.lateness)
+        while not cycle.is_over:
+            cycle.step(loop.wait(), loop.overruns)
+    return cycle.successor

@@ -6,13 +6,19 @@ from dataclasses import dataclass
 from dbc.catalogue import Catalogue, CatalogueError, EncodeError
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
+from dbc.watchdog import answer
+from gateway.causes import Cause, Finding
 from gateway.limits import Demand, clamp
 from gateway.messages import Mode
+from gateway.modes import DRIVING
 
 NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelLevel", "MilliTime", "NcomStatus00")
 ROBOT_MESSAGES = ("RC_SafetyStatus", "SR_Status", "AR_Status", "BR_Status")
-NEEDED_MESSAGES = NAVIGATION_MESSAGES + ROBOT_MESSAGES
-COMMAND_MESSAGES = ("GW_SafetyCommand", "SR_Command", "AR_Command", "BR_Command", "GW_Heartbeat")
+CAR_MESSAGES = ("CAR_WheelSpeeds", "CAR_Powertrain")
+NEEDED_MESSAGES = NAVIGATION_MESSAGES + ROBOT_MESSAGES + CAR_MESSAGES
+COMMAND_MESSAGES = ("GW_SafetyCommand", "SR_Command", "AR_Command", "BR_Command")
+MONITOR_MESSAGES = ("GW_Heartbeat", "GW_Status")
+ROBOT_NODES = ("SR", "AR", "BR")
 
 USABLE_POSITION_MODES = ("RTKInteger", "RTKFloat", "GxInteger", "GxFloat", "IxInteger", "IxFloat")
 """Position modes good to about 0.2 m; with any other the car would leave its lane without noticing."""
@@ -23,7 +29,16 @@ _MPS_PER_KMH = 1.0 / 3.6
 
 @dataclass(slots=True)
 class Measurement:
-    """Everything the gateway knows of the car, in SI units and ISO 8855 axes; updated in place as messages arrive."""
+    """Everything the gateway knows of the car, in SI units and ISO 8855 axes; updated in place as messages arrive.
+
+    Args:
+        wheel_speed_radps: front left, front right, rear left, rear right.
+        accelerator_norm, brake_norm: where the pedal robots are, shares of the stroke.
+        accelerator_pedal_norm, brake_pedal_norm: where the pedals are; a driver's foot may be deeper than the robot.
+        faulty_robots, deaf_robots, overridden_robots: nodes that report a fault, missing commands, a driver who takes over.
+        watchdog_question: the newest of the robot controller.
+        measurement_id: that the robot controller echoes.
+    """
 
     x_m: float = 0.0
     y_m: float = 0.0
@@ -35,12 +50,22 @@ class Measurement:
     navigation_time_ms: int = -1
     is_navigation_precise: bool = False
     steering_wheel_rad: float = 0.0
+    steering_wheel_rate_radps: float = 0.0
+    steering_torque_nm: float = 0.0
     accelerator_norm: float = 0.0
     brake_norm: float = 0.0
-    has_robot_fault: bool = False
-    has_command_timeout: bool = False
+    wheel_speed_radps: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    accelerator_pedal_norm: float = 0.0
+    brake_pedal_norm: float = 0.0
+    is_in_drive: bool = False
+    faulty_robots: tuple[str, ...] = ()
+    deaf_robots: tuple[str, ...] = ()
+    overridden_robots: tuple[str, ...] = ()
+    watchdog_question: int = 0
+    measurement_id: int = 0
     is_armed: bool = False
     is_engaged: bool = False
+    is_emergency_stopped: bool = False
     is_stopped_by_robots: bool = False
     is_dead_man_pressed: bool = False
     is_driver_override: bool = False
@@ -60,18 +85,49 @@ class RobotLimits:
     max_speed_mps: float = 36.0
 
 
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """What the safety command says besides mode and demand.
+
+    Args:
+        command_age_ms: time since a command was admitted [ms].
+        measurement_id: of the measurement that the demands answer.
+        watchdog_question: that is to be answered.
+    """
+
+    command_age_ms: float
+    measurement_id: int
+    watchdog_question: int
+    is_navigation_valid: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Monitors:
+    """What bus monitors are told.
+
+    Args:
+        finding: why the last engagement ended; None when none has.
+    """
+
+    uptime_s: float
+    rejected: int
+    mode: Mode
+    finding: Finding | None
+
+
 class Codec:
     """Decodes measurements and encodes demands by the catalogue."""
 
     def __init__(self, catalogue: Catalogue, limits: RobotLimits) -> None:
-        catalogue.require(NEEDED_MESSAGES + COMMAND_MESSAGES, "gateway")
+        catalogue.require(NEEDED_MESSAGES + COMMAND_MESSAGES + MONITOR_MESSAGES, "gateway")
         self._catalogue = catalogue
         self._limits = limits
         self._protectors: dict[str, E2EProtector] = {}
-        self._challenge = 0
+        self._robots: dict[str, dict[str, float]] = {}
         try:
             self._read_tables()
             self._rehearse()
+            self._robots.clear()
         except (KeyError, EncodeError) as error:
             raise CatalogueError(f"{', '.join(catalogue.sha256)}: not what the gateway needs: {error}") from error
         self._protectors = {
@@ -87,13 +143,17 @@ class Codec:
         self._usable_position_modes = {modes[name] for name in USABLE_POSITION_MODES}
         self._steer_modes = catalogue.enumeration("SR_Command", "Mode")
         self._pedal_modes = catalogue.enumeration("AR_Command", "Mode")
+        self._drive = catalogue.enumeration("CAR_Powertrain", "Selector")["D"]
+        mode_codes, cause_codes = (catalogue.enumeration("GW_Status", signal) for signal in ("Mode", "Cause"))
+        self._mode_codes = {mode: mode_codes[_camel(mode.name)] for mode in Mode}
+        self._cause_codes = {cause: cause_codes[_camel(cause.name)] for cause in Cause}
 
     def _rehearse(self) -> None:
         """Use every signal and every table entry once, so that a site's DBC that lacks one is refused now, not on the road."""
         self.update(Measurement(), {name: dict.fromkeys(self._catalogue.signals(name), 0.0) for name in NEEDED_MESSAGES})
         for mode in Mode:
-            self.encode(0, mode, Demand(0.0, 0.0, 0.0), 0.0, is_navigation_valid=True)
-        self.encode_heartbeat(0, 0.0, 0)
+            self.encode(0, mode, Demand(0.0, 0.0, 0.0), Cycle(0.0, 0, 0, is_navigation_valid=True))
+            self.encode_monitors(0, Monitors(0.0, 0, mode, Finding(Cause.TICK_GAP, 0.0, 0.0, "")))
 
     def update(self, measurement: Measurement, values: dict[str, dict[str, float]]) -> None:
         """Take the newest values of each message into the measurement."""
@@ -104,37 +164,46 @@ class Codec:
             self._update_supervisor(measurement, status)
         if navigation := values.get("NcomStatus00"):
             measurement.is_navigation_precise = int(navigation["PosMode"]) in self._usable_position_modes
-        robots = [values[name] for name in ROBOT_MESSAGES[1:] if name in values]
-        if len(robots) == len(ROBOT_MESSAGES) - 1:
-            measurement.has_robot_fault = any(robot["Fault"] for robot in robots)
-            measurement.has_command_timeout = any(robot["CommandTimeout"] for robot in robots)
+        for node in ROBOT_NODES:
+            if robot := values.get(f"{node}_Status"):
+                self._robots[node] = robot
+        measurement.faulty_robots = self._nodes_with("Fault")
+        measurement.deaf_robots = self._nodes_with("CommandTimeout")
+        measurement.overridden_robots = self._nodes_with("DriverOverride")
+        if powertrain := values.get("CAR_Powertrain"):
+            measurement.is_in_drive = int(powertrain["Selector"]) == self._drive
+
+    def _nodes_with(self, flag: str) -> tuple[str, ...]:
+        return tuple(node for node, robot in self._robots.items() if robot[flag])
 
     def _update_supervisor(self, measurement: Measurement, status: dict[str, float]) -> None:
         state = int(status["SystemState"])
         measurement.is_armed = state == self._system_states["Armed"]
         measurement.is_engaged = state == self._system_states["Engaged"]
-        stopped = ("EStop", "ControlledStop", "Fault")
-        measurement.is_stopped_by_robots = bool(status["EmergencyStopActive"]) or state in {self._system_states[s] for s in stopped}
+        measurement.is_emergency_stopped = bool(status["EmergencyStopActive"]) or state == self._system_states["EStop"]
+        measurement.is_stopped_by_robots = state in {self._system_states[s] for s in ("ControlledStop", "Fault")}
         measurement.is_dead_man_pressed = bool(status["DeadManPressed"])
         measurement.is_driver_override = bool(status["DriverOverride"])
         measurement.are_robots_ready = bool(status["SrReady"] and status["ArReady"] and status["BrReady"])
         measurement.stop_source = self._stop_sources.get(int(status["StopSource"]), "unknown")
+        measurement.watchdog_question = int(status["WatchdogQuestion"])
+        measurement.measurement_id = int(status["MeasurementId"])
 
-    def encode(self, now_ns: int, mode: Mode, demand: Demand, command_age_ms: float, is_navigation_valid: bool) -> list[CanFrame]:
+    def encode(self, now_ns: int, mode: Mode, demand: Demand, cycle: "Cycle") -> list[CanFrame]:
         """The cyclic frames of one tick: safety command and the three robot commands."""
         limits = self._limits
-        self._challenge = (self._challenge + 1) % 256
-        is_active = mode in (Mode.ENGAGED, Mode.SAFE_STOP)
+        is_active = mode in DRIVING
         steer_mode = self._steer_modes["AnglePosition" if is_active else "Standby"]
         pedal_mode = self._pedal_modes["Position" if is_active else "Standby"]
         messages: dict[str, dict[str, float]] = {
             "GW_SafetyCommand": {
                 "SystemRequest": self._requests[_REQUEST_OF_MODE[mode]],
-                "WatchdogChallenge": self._challenge,
+                "WatchdogAnswer": answer(cycle.watchdog_question),
                 "MaxSpeed": limits.max_speed_mps / _MPS_PER_KMH,
-                "NavigationValid": is_navigation_valid,
+                "NavigationValid": cycle.is_navigation_valid,
                 "TrajectoryValid": mode is Mode.ENGAGED,
-                "CommandAge": clamp(command_age_ms, 0.0, 255.0),
+                "CommandAge": clamp(cycle.command_age_ms, 0.0, 255.0),
+                "MeasurementId": cycle.measurement_id,
             },
             "SR_Command": {
                 "Mode": steer_mode,
@@ -148,9 +217,15 @@ class Codec:
         }
         return [self._frame(name, values, now_ns) for name, values in messages.items()]
 
-    def encode_heartbeat(self, now_ns: int, uptime_s: float, rejected: int) -> CanFrame:
-        """The life sign for bus monitors."""
-        return self._frame("GW_Heartbeat", {"UpTime": uptime_s, "RxErrorCount": min(rejected, 255)}, now_ns)
+    def encode_monitors(self, now_ns: int, monitors: "Monitors") -> list[CanFrame]:
+        """Life sign and status, for bus monitors."""
+        finding = monitors.finding
+        status: dict[str, float] = {"Mode": self._mode_codes[monitors.mode]}
+        if finding is not None:
+            found = {"Cause": self._cause_codes[finding.cause], "Value": finding.value, "Limit": finding.limit}
+            status |= {name: clamp(value, *self._catalogue.bounds("GW_Status", name)) for name, value in found.items()}
+        heartbeat = {"UpTime": monitors.uptime_s, "RxErrorCount": min(monitors.rejected, 255)}
+        return [self._frame("GW_Heartbeat", heartbeat, now_ns), self._frame("GW_Status", status, now_ns)]
 
     def _frame(self, name: str, values: dict[str, float], now_ns: int) -> CanFrame:
         payload = self._catalogue.encode(name, values)
@@ -160,12 +235,19 @@ class Codec:
 
 
 _REQUEST_OF_MODE = {
+    Mode.SILENT: "None",
     Mode.STANDBY: "Disarm",
     Mode.READY: "Arm",
     Mode.ENGAGED: "Engage",
+    Mode.COMFORT_STOP: "Engage",
     Mode.SAFE_STOP: "Engage",
-    Mode.FAULT: "Disarm",
+    Mode.FAULT: "None",
 }
+
+
+def _camel(name: str) -> str:
+    """How the DBC spells the name of a mode or a cause."""
+    return "".join(word.capitalize() for word in name.split("_"))
 
 
 def _pedal_command(mode: int, is_active: bool, position_norm: float, limits: RobotLimits, force_n: float) -> dict[str, float]:
@@ -204,6 +286,8 @@ def _decode_time(m: Measurement, v: dict[str, float]) -> None:
 
 def _decode_steering(m: Measurement, v: dict[str, float]) -> None:
     m.steering_wheel_rad = math.radians(v["AngleActual"])
+    m.steering_wheel_rate_radps = math.radians(v["RateActual"])
+    m.steering_torque_nm = v["TorqueActual"]
 
 
 def _decode_accelerator(m: Measurement, v: dict[str, float]) -> None:
@@ -212,6 +296,14 @@ def _decode_accelerator(m: Measurement, v: dict[str, float]) -> None:
 
 def _decode_brake(m: Measurement, v: dict[str, float]) -> None:
     m.brake_norm = 0.01 * v["PositionActual"]
+
+
+def _decode_wheels(m: Measurement, v: dict[str, float]) -> None:
+    m.wheel_speed_radps = (v["FrontLeft"], v["FrontRight"], v["RearLeft"], v["RearRight"])
+
+
+def _decode_pedals(m: Measurement, v: dict[str, float]) -> None:
+    m.accelerator_pedal_norm, m.brake_pedal_norm = 0.01 * v["AcceleratorPedal"], 0.01 * v["BrakePedal"]
 
 
 _DECODERS = {
@@ -224,4 +316,6 @@ _DECODERS = {
     "SR_Status": _decode_steering,
     "AR_Status": _decode_accelerator,
     "BR_Status": _decode_brake,
+    "CAR_WheelSpeeds": _decode_wheels,
+    "CAR_Powertrain": _decode_pedals,
 }

@@ -14,6 +14,8 @@ DRIVE_RANGE_NORM = 4.0
 
 NEVER_NS = 1 << 62
 
+_SECOND_SENDER = "second sender"
+
 
 class CommandGate:
     """Admits commands of one sender, newest first; counts the others by cause.
@@ -22,7 +24,10 @@ class CommandGate:
         newest: the last command that carries a usable plan, or None.
         status: what the last admitted command says of itself.
         good_in_a_row: commands of status OK since the last other one.
-        rejected: count by cause.
+        bad_in_a_row: rejected ones since the last admitted one.
+        strangers: commands of a second sender since the first was admitted.
+        last_cause: why the last rejected one was; empty when none was.
+        rejected: count by cause, since the start.
     """
 
     def __init__(self) -> None:
@@ -34,22 +39,36 @@ class CommandGate:
         self.newest: ControlCommand | None = None
         self.status = CommandStatus.OK
         self.good_in_a_row = 0
+        self.bad_in_a_row = 0
+        self.strangers = 0
+        self.last_cause = ""
         self._boot_id: int | None = None
         self._last_seq = -1
         self._admitted_ns: int | None = None
 
-    def offer(self, now_ns: int, command: ControlCommand | None, state_seq: int) -> None:
-        """Take a command in, or count why not. `state_seq` is the last state that was sent out."""
-        if command is None:
-            return
+    def offer(self, now_ns: int, command: ControlCommand, state_seq: int) -> bool:
+        """Take a command in, or count why not.
+
+        Args:
+            state_seq: the last state that was sent out.
+
+        Returns:
+            Whether it was admitted.
+        """
         if (cause := self._reject_cause(now_ns, command, state_seq)) is not None:
             self.rejected[cause] += 1
-            return
+            self.last_cause = cause
+            self.bad_in_a_row += 1
+            self.strangers += cause == _SECOND_SENDER
+            self.good_in_a_row = 0
+            return False
+        self.bad_in_a_row = 0
         self._boot_id, self._last_seq, self._admitted_ns = command.boot_id, command.seq, now_ns
         self.status = command.status
         self.good_in_a_row = self.good_in_a_row + 1 if command.status is CommandStatus.OK else 0
         if command.status is not CommandStatus.FAILED:
             self.newest = command
+        return True
 
     def age_ns(self, now_ns: int) -> int:
         """Time since a command was last admitted [ns]; very large when there never was one."""
@@ -57,7 +76,7 @@ class CommandGate:
 
     def _reject_cause(self, now_ns: int, command: ControlCommand, state_seq: int) -> str | None:
         causes = (
-            ("second sender", self._boot_id is not None and command.boot_id != self._boot_id),
+            (_SECOND_SENDER, self._boot_id is not None and command.boot_id != self._boot_id),
             ("repeated or old sequence number", command.boot_id == self._boot_id and command.seq <= self._last_seq),
             ("answers an old state", not state_seq - MAX_STATE_LAG <= command.state_seq <= state_seq),
             ("time of another clock", abs(command.t_ns - now_ns) > MAX_CLOCK_OFFSET_NS),

@@ -1,20 +1,68 @@
-"""What is true of the car, the robots and the controller in one tick, and the events and refusals that follow from it."""
+"""What is true of the car, the robots, the buses and the controller in one tick, and the findings and refusals that follow from it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
+from dbc.health import BusState, LinkHealth
+from gateway.causes import Cause, Finding
 from gateway.codec import Measurement
 from gateway.commands import CommandGate
-from gateway.messages import CommandStatus
-from gateway.modes import Event
+from gateway.limits import LimitProfile
+from gateway.messages import CommandStatus, Operation, OperatorRequest
 
 COMMAND_TIMEOUT_NS = 100_000_000
 """Age at which a command is too old: one missed solve is tolerated, two are not."""
+MAX_BAD_COMMANDS = 2
+"""Commands in a row, and of a second sender, that are only counted and dropped."""
 MAX_TICK_GAP_NS = 50_000_000
 """A gateway that slept longer must not go on with what it did before."""
+MAX_UNCONFIRMED_NS = 50_000_000
+"""Age of an own frame that has not got onto the bus: nobody acknowledges, or somebody floods."""
+WATCHDOG_TIMEOUT_NS = 100_000_000
+"""Time in which the robot controller has to ask another question."""
+
 READY_COMMANDS = 25
 """Good commands in a row before the gateway is ready: one second of the controller."""
+HOLD_NS = 1_000_000_000
+"""How long the preconditions have to hold without a break."""
+BUS_QUIET_NS = 10_000_000_000
+"""How long a bus must not have been bus-off."""
+MIN_DISK_FREE = 0.07
+"""Share of the record's disk that must be free: the figure of openpilot."""
+MAX_ENGAGE_COMMAND_AGE_NS = 60_000_000
+MAX_ENGAGE_STATE_AGE_NS = 50_000_000
+MAX_ENGAGE_STEER_RAD = 0.0349
+"""Difference between demanded and measured road-wheel angle: 2 degrees."""
+MAX_ENGAGE_LATERAL_M = 1.5
+MAX_ENGAGE_HEADING_RAD = 0.26
+"""Distance and heading from the path: Autoware's 1.5 m, and half of its 0.52 rad."""
+MAX_REQUEST_AGE_NS = 1_000_000_000
+"""A request that is older was not meant for now."""
+STANDING_MPS = 0.1
+"""Below this speed the car stands."""
+RESET_PATIENCE_NS = 30_000_000_000
+"""After this time a stop may be reset without a speed that says the car stands: from 36 m/s at 2.5 m/s2 it takes 15 s."""
 
 _MS_PER_NS = 1e-6
+_TROUBLED = (BusState.ERROR_WARNING, BusState.ERROR_PASSIVE)
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """What the process around the core tells it.
+
+    Args:
+        links: health of the bus of every network.
+        is_recording: whether the recorder takes what it is given.
+        disk_free_share: of the disk that it writes to.
+    """
+
+    links: Mapping[str, LinkHealth] = field(default_factory=dict)
+    is_recording: bool = True
+    disk_free_share: float = 1.0
+
+
+UNDISTURBED = Surroundings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,68 +70,204 @@ class Situation:
     """All that decides on the mode.
 
     Args:
-        missing: needed messages without a good frame within their timeout.
+        observed: findings of supervision, plausibility and latency.
+        state_age_ns: time since the newest time of validity of the navigation data [ns].
+        navigation_timeout_ns: age from which they count as frozen [ns].
+        question_age_ns: time since the robot controller last asked another question [ns].
         tick_gap_ns: time since the previous step [ns].
-        is_navigation_frozen: frames arrive, but their time of validity stands still.
-        is_engagement_settled: the robots have had time to follow into Engaged.
+        is_driving: the gateway moves the car.
+        is_settled: the robots have had time to follow into Engaged.
+        steer_rad: road-wheel angle that is measured [rad].
+        stopping_ns: time since the present stop began [ns]; 0 when there is none.
     """
 
     now_ns: int
     measurement: Measurement
     commands: CommandGate
-    missing: list[str]
+    surroundings: Surroundings
+    profile: LimitProfile
+    observed: Sequence[Finding]
+    state_age_ns: int
+    navigation_timeout_ns: int
+    question_age_ns: int
     tick_gap_ns: int
-    is_navigation_frozen: bool
-    is_engagement_settled: bool
+    is_driving: bool
+    is_settled: bool
+    steer_rad: float
+    stopping_ns: int
 
 
-def state_faults(s: Situation) -> list[str]:
+def state_findings(s: Situation) -> list[Finding]:
     """Why the state estimate cannot be used; empty when it can."""
-    if s.missing:
-        return ["no good " + ", ".join(s.missing)]
-    faults = []
-    if s.is_navigation_frozen:
-        faults.append("navigation data frozen")
+    found = [finding for finding in s.observed if finding.cause in _STATE_CAUSES]
+    if s.state_age_ns > s.navigation_timeout_ns:
+        found.append(Finding(Cause.NAVIGATION_FROZEN, s.state_age_ns * _MS_PER_NS, s.navigation_timeout_ns * _MS_PER_NS, "navigation"))
     if not s.measurement.is_navigation_precise:
-        faults.append("position mode too coarse")
-    return faults
+        found.append(Finding(Cause.NAVIGATION_COARSE, 0, 1, "navigation"))
+    return found
 
 
-def blockers(s: Situation) -> list[str]:
-    """What keeps the gateway from being ready, each by name; empty when nothing does."""
+_STATE_CAUSES = (
+    *(Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID, Cause.SPEED_IMPLAUSIBLE, Cause.POSITION_IMPLAUSIBLE),
+    *(Cause.YAW_RATE_IMPLAUSIBLE, Cause.STEERING_IMPLAUSIBLE),
+)
+
+
+def findings(s: Situation, of_state: Sequence[Finding]) -> list[Finding]:
+    """What would end an engagement now.
+
+    Args:
+        of_state: `state_findings` of the same situation.
+    """
+    found = [*of_state, *(finding for finding in s.observed if finding.cause not in _STATE_CAUSES)]
+    found += _bus_findings(s.surroundings.links)
+    found += [finding for is_true, finding in _robot_findings(s) if is_true]
+    found += [finding for is_true, finding in _command_findings(s) if is_true]
+    if s.is_driving:
+        found += [finding for is_true, finding in _driving_findings(s) if is_true]
+    return found
+
+
+def _bus_findings(links: Mapping[str, LinkHealth]) -> list[Finding]:
+    found = []
+    for network, link in links.items():
+        if link.state is BusState.DOWN:
+            found.append(Finding(Cause.BUS_DOWN, 1, 0, network))
+        elif link.state is BusState.BUS_OFF:
+            found.append(Finding(Cause.BUS_OFF, link.bus_offs, 0, network))
+        elif link.unconfirmed_ns > MAX_UNCONFIRMED_NS:
+            found.append(Finding(Cause.BUS_BLOCKED, link.unconfirmed_ns * _MS_PER_NS, MAX_UNCONFIRMED_NS * _MS_PER_NS, network))
+    return found
+
+
+Judged = Sequence[tuple[bool, Finding]]
+
+
+def _robot_findings(s: Situation) -> Judged:
+    m = s.measurement
+    question_ms = s.question_age_ns * _MS_PER_NS
+    return (
+        (m.is_emergency_stopped, Finding(Cause.ROBOTS_EMERGENCY_STOP, 1, 0, m.stop_source)),
+        (m.is_stopped_by_robots, Finding(Cause.ROBOTS_STOPPED, 1, 0, m.stop_source)),
+        (bool(m.faulty_robots), Finding(Cause.ROBOT_FAULT, len(m.faulty_robots), 0, ", ".join(m.faulty_robots))),
+        (s.question_age_ns > WATCHDOG_TIMEOUT_NS, Finding(Cause.WATCHDOG_SILENT, question_ms, WATCHDOG_TIMEOUT_NS * _MS_PER_NS, "RC")),
+        (bool(m.overridden_robots), Finding(_override(m), len(m.overridden_robots), 0, ", ".join(m.overridden_robots))),
+        (m.is_driver_override and not m.overridden_robots, Finding(Cause.DRIVER_OVERRIDE, 1, 0, "RC")),
+        (not m.is_in_drive, Finding(Cause.SELECTOR_NOT_IN_DRIVE, 0, 1, "CAR_Powertrain")),
+        (abs(m.vx_mps) > s.profile.max_speed_mps, Finding(Cause.OVERSPEED, abs(m.vx_mps), s.profile.max_speed_mps, "navigation")),
+    )
+
+
+_OVERRIDES = {"SR": Cause.DRIVER_STEERS, "BR": Cause.DRIVER_BRAKES, "AR": Cause.DRIVER_ACCELERATES}
+
+
+def _override(m: Measurement) -> Cause:
+    """What the driver does, by the first of the robots that he overrides; only asked when there is one."""
+    return next((cause for node, cause in _OVERRIDES.items() if node in m.overridden_robots), Cause.DRIVER_OVERRIDE)
+
+
+def _command_findings(s: Situation) -> Judged:
+    c = s.commands
+    sender = f"controller ({c.last_cause})" if c.bad_in_a_row else "controller"
+    age_ms, limit_ms = min(c.age_ns(s.now_ns) * _MS_PER_NS, 1e6), COMMAND_TIMEOUT_NS * _MS_PER_NS
+    return (
+        (c.status is CommandStatus.FAILED, Finding(Cause.COMMAND_FAILED, 1, 0, "controller")),
+        (age_ms > limit_ms, Finding(Cause.COMMAND_LOST, age_ms, limit_ms, sender)),
+        (c.bad_in_a_row > MAX_BAD_COMMANDS, Finding(Cause.COMMAND_INVALID, c.bad_in_a_row, MAX_BAD_COMMANDS, c.last_cause)),
+        (c.strangers > MAX_BAD_COMMANDS, Finding(Cause.SECOND_CONTROLLER, c.strangers, MAX_BAD_COMMANDS, "controller")),
+    )
+
+
+def _driving_findings(s: Situation) -> Judged:
+    m = s.measurement
+    gap_ms = s.tick_gap_ns * _MS_PER_NS
+    deaf = ", ".join(m.deaf_robots)
+    return (
+        (s.tick_gap_ns > MAX_TICK_GAP_NS, Finding(Cause.TICK_GAP, gap_ms, MAX_TICK_GAP_NS * _MS_PER_NS, "gateway")),
+        (s.is_settled and bool(m.deaf_robots), Finding(Cause.ROBOT_MISSES_COMMANDS, len(m.deaf_robots), 0, deaf)),
+        (s.is_settled and not m.is_engaged, Finding(Cause.ROBOTS_NOT_ENGAGED, 0, 1, "RC")),
+    )
+
+
+def blockers(s: Situation, found: Sequence[Finding]) -> list[str]:
+    """What keeps the gateway from READY, each by name; empty when nothing does.
+
+    Args:
+        found: `findings` of the same situation.
+    """
     m = s.measurement
     conditions = (
-        (m.is_stopped_by_robots, f"robots stopped by {m.stop_source}"),
-        (m.has_robot_fault, "a robot reports a fault"),
         (not m.are_robots_ready, "robots not ready"),
         (not m.is_dead_man_pressed, "dead-man not pressed"),
-        (m.is_driver_override, "driver override"),
-        (s.commands.age_ns(s.now_ns) > COMMAND_TIMEOUT_NS, "controller silent"),
-        (s.commands.good_in_a_row < READY_COMMANDS, f"fewer than {READY_COMMANDS} good commands in a row"),
+        (s.commands.good_in_a_row < READY_COMMANDS, f"{s.commands.good_in_a_row} good commands in a row, {READY_COMMANDS} needed"),
+        (not s.surroundings.is_recording, "recorder does not record"),
+        (
+            s.surroundings.disk_free_share < MIN_DISK_FREE,
+            f"{100 * s.surroundings.disk_free_share:.1f} % of the record's disk free, {100 * MIN_DISK_FREE:.0f} % needed",
+        ),
     )
-    return state_faults(s) + [name for is_true, name in conditions if is_true]
+    blocked = [str(finding) for finding in found] + [name for is_true, name in conditions if is_true]
+    for network, link in s.surroundings.links.items():
+        if link.state in _TROUBLED:
+            blocked.append(f"bus {network} is {link.state.value}")
+        if link.last_bus_off_ns is not None and s.now_ns - link.last_bus_off_ns < BUS_QUIET_NS:
+            blocked.append(f"bus {network} was bus-off {(s.now_ns - link.last_bus_off_ns) * 1e-9:.0f} s ago")
+    return blocked
 
 
-def events(s: Situation, blocked_by: list[str]) -> dict[Event, str]:
-    """Events of this tick, each with a detail for people; the mode table decides which of them matter."""
-    m = s.measurement
-    age_ns = s.commands.age_ns(s.now_ns)
-    faults = state_faults(s)
+def settling(good_ns: int) -> list[str]:
+    """That nothing has been in the way for too short a time [ns]; empty when it is long enough."""
+    return [f"everything good for {good_ns * 1e-9:.1f} s, {HOLD_NS * 1e-9:.1f} s needed"] if good_ns < HOLD_NS else []
+
+
+def untimely(request: OperatorRequest, now_ns: int, last_ns: int) -> str:
+    """Why a request must not act at this time; empty when it may.
+
+    Args:
+        last_ns: time of the request that was looked at last [ns]; all who ask share one clock.
+    """
+    age_ns = now_ns - request.t_ns
+    if age_ns < 0:
+        return "the request is from the future"
+    if request.t_ns <= last_ns:
+        return "the request is repeated, or made before another one"
+    if age_ns > MAX_REQUEST_AGE_NS and request.operation is not Operation.STOP:
+        return f"the request is {age_ns * 1e-9:.1f} s old, limit {MAX_REQUEST_AGE_NS * 1e-9:.0f} s"
+    return ""
+
+
+def refusals(operation: Operation, s: Situation, blocked_by: Sequence[str]) -> list[str]:
+    """What of the operator's request cannot be granted because of the situation; empty when all is well."""
+    match operation:
+        case Operation.ARM:
+            return list(blocked_by)
+        case Operation.ENGAGE:
+            return [*blocked_by, *_engage_refusals(s)]
+        case Operation.DISENGAGE if s.stopping_ns:
+            return ["a stop is ended by a reset"]
+        case Operation.RESET if 0 < s.stopping_ns < RESET_PATIENCE_NS and abs(s.measurement.vx_mps) > STANDING_MPS:
+            return [f"the car moves: {s.measurement.vx_mps:.1f} m/s"]
+    return []
+
+
+def _engage_refusals(s: Situation) -> list[str]:
+    m, command = s.measurement, s.commands.newest
+    if command is None:
+        return ["no command"]
+    command_age_ns = s.commands.age_ns(s.now_ns)
+    steer_rad = abs(command.steer_rad - s.steer_rad)
     conditions = (
-        (Event.EMERGENCY_STOP, m.is_stopped_by_robots, m.stop_source),
-        (Event.ROBOT_FAULT, m.has_robot_fault, "a robot reports a fault"),
-        (Event.ROBOT_FAULT, m.has_command_timeout and s.is_engagement_settled, "a robot misses our commands"),
-        (Event.ROBOT_FAULT, not m.is_engaged and s.is_engagement_settled, "the robot controller is not engaged"),
-        (Event.STATE_LOST, bool(faults), ", ".join(faults)),
-        (Event.COMMAND_FAILED, s.commands.status is CommandStatus.FAILED, "no usable solution"),
-        (Event.COMMAND_LOST, age_ns > COMMAND_TIMEOUT_NS, f"command older than {COMMAND_TIMEOUT_NS * _MS_PER_NS:.0f} ms"),
-        (Event.TICK_GAP, s.tick_gap_ns > MAX_TICK_GAP_NS, f"{s.tick_gap_ns * _MS_PER_NS:.0f} ms without a step"),
-        (Event.DRIVER_OVERRIDE, m.is_driver_override, ""),
-        (Event.NOT_READY, bool(blocked_by), ", ".join(blocked_by)),
-        (Event.ALL_READY, not blocked_by, ""),
+        (not m.is_armed, "robots not armed"),
+        (command_age_ns > MAX_ENGAGE_COMMAND_AGE_NS, f"newest command {command_age_ns * _MS_PER_NS:.0f} ms old, limit 60 ms"),
+        (s.state_age_ns > MAX_ENGAGE_STATE_AGE_NS, f"state {s.state_age_ns * _MS_PER_NS:.0f} ms old, limit 50 ms"),
+        (steer_rad > MAX_ENGAGE_STEER_RAD, f"steering {steer_rad:.3f} rad from the demand, limit {MAX_ENGAGE_STEER_RAD} rad"),
+        (
+            abs(command.lateral_error_m) > MAX_ENGAGE_LATERAL_M,
+            f"{command.lateral_error_m:.2f} m beside the path, limit {MAX_ENGAGE_LATERAL_M} m",
+        ),
+        (
+            abs(command.heading_error_rad) > MAX_ENGAGE_HEADING_RAD,
+            f"heading {command.heading_error_rad:.2f} rad from the path, limit {MAX_ENGAGE_HEADING_RAD} rad",
+        ),
     )
-    happened: dict[Event, str] = {}
-    for event, is_true, detail in conditions:
-        if is_true:
-            happened.setdefault(event, detail)
-    return happened
+    return [name for is_true, name in conditions if is_true]

@@ -10,14 +10,18 @@ from dbc.catalogue import Catalogue
 from dbc.frame import CanFrame
 from dbc.vehicle import Vehicle
 from gateway.actuation import Actuation
-from gateway.codec import NEEDED_MESSAGES, Codec, Measurement, RobotLimits
-from gateway.commands import CommandGate
-from gateway.conditions import Situation, blockers, events, state_faults
+from gateway.causes import Cause, Disengagement, Finding
+from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, RobotLimits
+from gateway.commands import MAX_STATE_LAG, CommandGate
+from gateway.conditions import UNDISTURBED, Situation, Surroundings, blockers, findings, refusals, settling, state_findings, untimely
+from gateway.latency import LatencyChain
 from gateway.limits import PROVING_GROUND, Demand, LimitProfile
-from gateway.messages import ControlCommand, Mode, Operation, OperatorRequest, VehicleState
-from gateway.modes import Event, ModeMachine, Transition
+from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest, VehicleState
+from gateway.modes import DRIVING, REACTIONS, TRANSITIONS, ModeMachine, Transition, Trigger
+from gateway.plausibility import Plausibility
 from gateway.safe_stop import SafeStop, plan_index
 from gateway.supervision import Supervisor
+from gateway.transmit import TransmitGate
 
 TICK_NS = 10_000_000
 """Period of the gateway [ns]: that of the fastest cyclic messages."""
@@ -26,11 +30,9 @@ ENGAGE_GRACE_NS = 200_000_000
 
 _TIME_MESSAGE = "MilliTime"
 """Tells the time of validity of the navigation data."""
-_EVENT_OF_OPERATION = {
-    Operation.ENGAGE: Event.ENGAGE_REQUESTED,
-    Operation.DISENGAGE: Event.DISENGAGE_REQUESTED,
-    Operation.RESET: Event.RESET_REQUESTED,
-}
+_TRIGGER_OF_OPERATION = {Operation.ARM: Trigger.ARM, Operation.ENGAGE: Trigger.ENGAGE, Operation.RESET: Trigger.RESET}
+_STOPPED = (Mode.COMFORT_STOP, Mode.SAFE_STOP, Mode.FAULT)
+_CAUSE_OF_OPERATION = {Operation.DISENGAGE: Cause.OPERATOR_DISENGAGE, Operation.STOP: Cause.OPERATOR_STOP}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,13 +41,15 @@ class StepOutput:
 
     Args:
         frames: to be sent on the bus now.
-        state: to be sent to the controller.
+        state: to be sent to the controller; the one that `sense` has given since the step before, if it has given one.
         transition: the change of mode in this step, if any.
+        reply: to the operator, if he asked for something new.
     """
 
     frames: list[CanFrame]
     state: VehicleState
     transition: Transition | None
+    reply: OperatorReply | None
 
 
 class GatewayCore:
@@ -53,28 +57,43 @@ class GatewayCore:
 
     Attributes:
         measurement: what is known of the car and the robots.
+        findings: what would end an engagement now.
         blockers: what keeps the gateway from READY, by name; empty when nothing does.
+        disengagement: how the last engagement ended; None when none has.
     """
 
     def __init__(self, catalogue: Catalogue, vehicle: Vehicle, boot_id: int, profile: LimitProfile = PROVING_GROUND) -> None:
-        self._profile = profile
+        self.profile = profile
         self._ratio = vehicle.steering.ratio
         self._boot_id = boot_id
         self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps))
         self._navigation_timeout_ns = catalogue.by_name[_TIME_MESSAGE].timeout_ns
-        self._heartbeat_ticks = catalogue.by_name["GW_Heartbeat"].cycle_time_ns // TICK_NS
+        self._monitor_ticks = catalogue.by_name["GW_Status"].cycle_time_ns // TICK_NS
         self._modes = ModeMachine()
+        self._plausibility = Plausibility(vehicle)
+        self._gate = TransmitGate(catalogue)
         self._safe_stop: SafeStop | None = None
         self._last_step_ns: int | None = None
+        self._good_since_ns: int | None = None
         self._state_time_ns = 0
+        self._state_seq = 0
+        self._is_state_good = False
+        self._sensed: VehicleState | None = None
+        self._asked_ns = 0
         self._engaged_since_ns = 0
-        self._request_seq: dict[int, int] = {}
+        self._stop_since_ns: int | None = None
+        self._state_times_ns = [0] * (MAX_STATE_LAG + 1)
+        self._measurement_id = 0
+        self._last_request_ns = 0
         self.ticks = 0
         self.supervisor = Supervisor(catalogue, NEEDED_MESSAGES)
         self.commands = CommandGate()
+        self.latency = LatencyChain()
         self.actuation = Actuation(vehicle, profile, TICK_NS)
         self.measurement = Measurement()
+        self.findings: list[Finding] = []
         self.blockers: list[str] = []
+        self.disengagement: Disengagement | None = None
 
     @property
     def mode(self) -> Mode:
@@ -87,57 +106,131 @@ class GatewayCore:
         return self._modes.reason
 
     def step(
-        self, now_ns: int, frames: Sequence[CanFrame], command: ControlCommand | None = None, request: OperatorRequest | None = None
+        self,
+        now_ns: int,
+        frames: Sequence[CanFrame],
+        command: ControlCommand | None = None,
+        request: OperatorRequest | None = None,
+        surroundings: Surroundings = UNDISTURBED,
     ) -> StepOutput:
         """Advance to `now_ns` with what has arrived since the last step."""
-        self._observe(frames)
-        self.commands.offer(now_ns, command, self.ticks)
-        situation = self._situation(now_ns)
-        self.blockers = blockers(situation)
-        transition = self._modes.update(now_ns, events(situation, self.blockers) | self._operator_event(request))
+        if self._last_step_ns is None:
+            self._last_request_ns = now_ns - TICK_NS  # what was asked before this gateway lived does not act
+        self._observe(now_ns, frames)
+        self._admit(now_ns, command)
+        situation = self._situation(now_ns, surroundings)
+        of_state = state_findings(situation)
+        self._is_state_good = not of_state
+        self.findings = findings(situation, of_state)
+        self.blockers = self._blockers(situation)
+        refused = [] if request is None else self._refusals(request, situation)
+        granted = None if refused or request is None else request.operation
+        transition = self._modes.update(now_ns, self._with_request(granted), self._triggers(granted))
         if transition is not None:
             self._enter(now_ns, transition)
         self._actuate(now_ns)
         self._last_step_ns = now_ns
         self.ticks += 1
-        return StepOutput(self._encode(now_ns), self._state(not state_faults(situation)), transition)
+        state, self._sensed = self._sensed or self._state(), None
+        reply = None if request is None else OperatorReply(request.boot_id, request.seq, request.operation, self.mode, tuple(refused))
+        return StepOutput(self._gate.admit(now_ns, self.mode, self._encode(now_ns)), state, transition, reply)
 
-    def _observe(self, frames: Sequence[CanFrame]) -> None:
-        previous_time_ms = self.measurement.navigation_time_ms
-        self._codec.update(self.measurement, self.supervisor.observe(frames))
-        if self.measurement.navigation_time_ms != previous_time_ms:
+    def sense(self, now_ns: int, frames: Sequence[CanFrame]) -> VehicleState | None:
+        """Take frames in between two steps.
+
+        Returns:
+            A state for the controller at once when the navigation data are new; what is wrong with them is judged by `step`.
+        """
+        before_ns = self._state_time_ns
+        self._observe(now_ns, frames)
+        if self._state_time_ns == before_ns:
+            return None
+        self._sensed = self._state()
+        return self._sensed
+
+    def _observe(self, now_ns: int, frames: Sequence[CanFrame]) -> None:
+        m = self.measurement
+        before = (m.navigation_time_ms, m.watchdog_question, m.measurement_id)
+        self._codec.update(m, self.supervisor.observe(frames))
+        if m.navigation_time_ms != before[0]:
             # Only a new time of validity makes the state young: a frozen navigation system grows old.
-            self._state_time_ns = self.supervisor.arrival_ns(_TIME_MESSAGE)
+            self._state_time_ns = self.supervisor.arrival_ns(_TIME_MESSAGE) or 0
+        if m.watchdog_question != before[1]:
+            self._asked_ns = now_ns
+        if m.measurement_id != before[2]:
+            self.latency.echoed(m.measurement_id, now_ns)
 
-    def _situation(self, now_ns: int) -> Situation:
+    def _admit(self, now_ns: int, command: ControlCommand | None) -> None:
+        if command is not None and self.commands.offer(now_ns, command, self._state_seq):
+            self._measurement_id = self.latency.answered(self._state_times_ns[command.state_seq % len(self._state_times_ns)])
+
+    def _situation(self, now_ns: int, surroundings: Surroundings) -> Situation:
+        m, is_driving = self.measurement, self.mode in DRIVING
+        is_settled = self.mode is not Mode.ENGAGED or now_ns - self._engaged_since_ns > ENGAGE_GRACE_NS
+        observed = self.supervisor.findings(now_ns)
+        observed += self._plausibility.update(now_ns, m, self.actuation.demand, is_driving and is_settled)
+        if is_driving:
+            observed += self.latency.findings(now_ns)
         return Situation(
             now_ns=now_ns,
-            measurement=self.measurement,
+            measurement=m,
             commands=self.commands,
-            missing=self.supervisor.missing(now_ns),
+            surroundings=surroundings,
+            profile=self.profile,
+            observed=observed,
+            state_age_ns=now_ns - self._state_time_ns,
+            navigation_timeout_ns=self._navigation_timeout_ns,
+            question_age_ns=now_ns - self._asked_ns,
             tick_gap_ns=0 if self._last_step_ns is None else now_ns - self._last_step_ns,
-            is_navigation_frozen=now_ns - self._state_time_ns > self._navigation_timeout_ns,
-            is_engagement_settled=self.mode is not Mode.ENGAGED or now_ns - self._engaged_since_ns > ENGAGE_GRACE_NS,
+            is_driving=is_driving,
+            is_settled=is_settled,
+            steer_rad=m.steering_wheel_rad / self._ratio,
+            stopping_ns=0 if self._stop_since_ns is None else now_ns - self._stop_since_ns,
         )
 
-    def _operator_event(self, request: OperatorRequest | None) -> dict[Event, str]:
-        """The event of a request that is new; a repeated datagram acts once."""
-        if request is None or request.seq <= self._request_seq.get(request.boot_id, -1):
-            return {}
-        self._request_seq[request.boot_id] = request.seq
-        if request.operation is Operation.ENGAGE and not self.measurement.is_armed:
-            return {}  # the robots arm after the gateway is ready; until then an engagement is refused
-        return {_EVENT_OF_OPERATION[request.operation]: ""}
+    def _blockers(self, situation: Situation) -> list[str]:
+        blocked = blockers(situation, self.findings)
+        if blocked:
+            self._good_since_ns = None
+            return blocked
+        if self._good_since_ns is None:
+            self._good_since_ns = situation.now_ns
+        return settling(situation.now_ns - self._good_since_ns)
+
+    def _refusals(self, request: OperatorRequest, situation: Situation) -> list[str]:
+        """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
+        if refused := untimely(request, situation.now_ns, self._last_request_ns):
+            return [refused]
+        self._last_request_ns = request.t_ns
+        trigger = _TRIGGER_OF_OPERATION.get(request.operation) or REACTIONS[_CAUSE_OF_OPERATION[request.operation]]
+        if (self.mode, trigger) not in TRANSITIONS:
+            return [f"not possible in {self.mode.name}"]
+        return refusals(request.operation, situation, self.blockers)
+
+    def _with_request(self, granted: Operation | None) -> list[Finding]:
+        """The findings, and what the operator wants ended."""
+        cause = None if granted is None else _CAUSE_OF_OPERATION.get(granted)
+        return self.findings if cause is None else [*self.findings, Finding(cause, 1, 0, "operator")]
+
+    def _triggers(self, granted: Operation | None) -> frozenset[Trigger]:
+        blocked = [Trigger.BLOCKED] if self.blockers else []
+        asked = [_TRIGGER_OF_OPERATION[granted]] if granted in _TRIGGER_OF_OPERATION else []
+        return frozenset(blocked + asked)
 
     def _enter(self, now_ns: int, transition: Transition) -> None:
         m = self.measurement
+        if transition.before in DRIVING and transition.finding is not None:
+            self.disengagement = Disengagement(now_ns, transition.finding)
         if transition.after is Mode.ENGAGED:
             self._engaged_since_ns = now_ns
+            self.latency.restart()
             self.actuation.start_from(Demand(m.steering_wheel_rad, m.accelerator_norm, m.brake_norm))
-        elif transition.after is Mode.SAFE_STOP:
-            self._safe_stop = SafeStop(now_ns, self.commands.newest, self.actuation.steer_rad, -m.ax_mps2, self._profile)
+        elif transition.after in (Mode.COMFORT_STOP, Mode.SAFE_STOP):
+            grade = self.profile.safe_stop if transition.after is Mode.SAFE_STOP else self.profile.comfort_stop
+            self._safe_stop = SafeStop(now_ns, self.commands.newest, self.actuation.steer_rad, -m.ax_mps2, grade)
         elif transition.after is Mode.STANDBY and transition.before is not Mode.READY:
             self.commands.reset()
+        self._stop_since_ns = now_ns if transition.after in _STOPPED else None
 
     def _actuate(self, now_ns: int) -> None:
         """Choose what the robots are to do in this mode."""
@@ -145,7 +238,7 @@ class GatewayCore:
         if self.mode is Mode.ENGAGED and command is not None:
             k = plan_index(command, now_ns)
             self.actuation.follow(command.plan_steer_rad[k], command.plan_drive_norm[k], m.vx_mps, m.brake_norm)
-        elif self.mode is Mode.SAFE_STOP and self._safe_stop is not None:
+        elif self.mode in (Mode.COMFORT_STOP, Mode.SAFE_STOP) and self._safe_stop is not None:
             stop = self._safe_stop.demand(now_ns, m.vx_mps)
             if stop.is_standing:
                 self.actuation.hold_still()
@@ -154,14 +247,16 @@ class GatewayCore:
         else:
             self.actuation.release()
 
-    def _state(self, is_valid: bool) -> VehicleState:
+    def _state(self) -> VehicleState:
         m = self.measurement
+        self._state_seq += 1
+        self._state_times_ns[self._state_seq % len(self._state_times_ns)] = self._state_time_ns
         return VehicleState(
             boot_id=self._boot_id,
-            seq=self.ticks,
+            seq=self._state_seq,
             t_ns=self._state_time_ns,
             mode=self.mode,
-            is_valid=is_valid,
+            is_valid=self._is_state_good,
             x_m=m.x_m,
             y_m=m.y_m,
             yaw_rad=m.yaw_rad,
@@ -174,10 +269,15 @@ class GatewayCore:
         )
 
     def _encode(self, now_ns: int) -> list[CanFrame]:
-        age_ms = self.commands.age_ns(now_ns) * 1e-6
-        is_precise = self.measurement.is_navigation_precise
-        frames = self._codec.encode(now_ns, self.mode, self.actuation.demand, age_ms, is_precise)
-        if self.ticks % self._heartbeat_ticks == 0:
-            uptime_s = self.ticks * TICK_NS * 1e-9
-            frames.append(self._codec.encode_heartbeat(now_ns, uptime_s, self.supervisor.rejected.total()))
+        if self.mode is Mode.SILENT:
+            return []
+        m, frames = self.measurement, []
+        if self.mode is not Mode.FAULT:  # then the robots' own timeout stops the car
+            age_ms = self.commands.age_ns(now_ns) * 1e-6
+            cycle = Cycle(age_ms, self._measurement_id, m.watchdog_question, m.is_navigation_precise)
+            frames = self._codec.encode(now_ns, self.mode, self.actuation.demand, cycle)
+        if self.ticks % self._monitor_ticks == 0:
+            finding = None if self.disengagement is None else self.disengagement.finding
+            monitors = Monitors(self.ticks * TICK_NS * 1e-9, self.supervisor.rejected.total(), self.mode, finding)
+            frames += self._codec.encode_monitors(now_ns, monitors)
         return frames

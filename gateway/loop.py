@@ -1,19 +1,48 @@
 """The periodic loop of a real-time process: absolute deadlines, skipped rather than caught up with after a stall."""
 
 import time
+from array import array
+from bisect import bisect_left
+
+BUCKETS_NS = tuple(bound_us * 1_000 for bound_us in (20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000))
+"""Upper ends of the buckets of a histogram [ns]; what is longer falls into one more."""
+
+
+class Histogram:
+    """Counts durations in fixed buckets; takes no memory while it counts, and may be read from another thread.
+
+    Attributes:
+        counts: for every bucket of `BUCKETS_NS`, and one for what is longer.
+        sum_ns, max_ns: of all durations [ns].
+    """
+
+    def __init__(self) -> None:
+        self.counts = array("Q", bytes(8 * (len(BUCKETS_NS) + 1)))
+        self.sum_ns = 0
+        self.max_ns = 0
+
+    def observe(self, duration_ns: int) -> None:
+        """Count one duration [ns]."""
+        self.counts[bisect_left(BUCKETS_NS, duration_ns)] += 1
+        self.sum_ns += duration_ns
+        self.max_ns = max(self.max_ns, duration_ns)
 
 
 class PeriodicLoop:
     """Wakes its caller on a fixed grid of the monotonic clock.
 
+    Args:
+        lateness: takes how long after its deadline every wake-up came; a new one by default.
+
     Attributes:
         overruns: periods that were skipped because the caller or the machine was late by a whole period or more.
     """
 
-    def __init__(self, period_ns: int) -> None:
+    def __init__(self, period_ns: int, lateness: Histogram | None = None) -> None:
         self._period_ns = period_ns
         self._deadline_ns = time.monotonic_ns() + period_ns
         self.overruns = 0
+        self.lateness = lateness or Histogram()
 
     def wait(self) -> int:
         """Sleep until the next deadline; the monotonic time of the wake-up [ns]."""
@@ -21,7 +50,9 @@ class PeriodicLoop:
         if remaining_ns > 0:
             time.sleep(remaining_ns * 1e-9)
         now_ns = time.monotonic_ns()
-        skipped = (now_ns - self._deadline_ns) // self._period_ns
+        late_ns = max(now_ns - self._deadline_ns, 0)  # a sleep may end a nanosecond early
+        self.lateness.observe(late_ns)
+        skipped = late_ns // self._period_ns
         self.overruns += skipped
         self._deadline_ns += (skipped + 1) * self._period_ns
         return now_ns

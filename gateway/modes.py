@@ -1,85 +1,146 @@
-"""The mode machine of the gateway. Rule 1: everything that affects the mode is in this file, as one table.
+"""The mode machine of the gateway. Rule 1: everything that affects the mode is in this file, as two tables.
 
-    STANDBY     silent: robots disarmed; waits until everything that an engagement needs is good
-    READY       robots armed, neutral demands; waits for the operator
-    ENGAGED     the controller's commands drive the car
-    SAFE_STOP   the gateway itself brings the car to a stop and holds it, until the operator resets
-    FAULT       the robots cannot be relied on: disarmed, until the operator resets
+    SILENT        nothing is sent; the state after every start
+    STANDBY       robots disarmed
+    READY         robots armed, neutral demands; waits for the operator
+    ENGAGED       the controller's commands drive the car
+    COMFORT_STOP  the gateway itself brings the car to a gentle stop and holds it
+    SAFE_STOP     the same, firmly
+    FAULT         the robots cannot be reached or relied on: disarmed
 
-Nothing re-engages by itself: SAFE_STOP and FAULT are left by a reset of the operator only.
+An engagement takes two steps, ARM and ENGAGE, each a request of the operator with preconditions of its own (`conditions`).
+Nothing re-engages by itself: stops and FAULT are left by a reset of the operator, or by a driver who takes the wheel.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+from gateway.causes import Cause, Finding
 from gateway.messages import Mode
 
 
-class Event(Enum):
+class Trigger(Enum):
     """What can change the mode, the gravest first: when several happen in one tick, the first that has a row acts."""
 
-    EMERGENCY_STOP = "emergency stop of the robot controller"
-    ROBOT_FAULT = "robot fault"
-    STATE_LOST = "vehicle state lost"
-    COMMAND_FAILED = "controller failed"
-    COMMAND_LOST = "controller silent"
-    TICK_GAP = "gateway was stopped"
-    DRIVER_OVERRIDE = "driver override"
-    DISENGAGE_REQUESTED = "operator disengaged"
-    RESET_REQUESTED = "operator reset"
-    NOT_READY = "not ready"
-    ENGAGE_REQUESTED = "operator engaged"
-    ALL_READY = "everything ready"
+    GIVE_UP = "the robots cannot be relied on"
+    STOP = "stop"
+    STOP_GENTLY = "gentle stop"
+    HAND_OVER = "driver or operator takes over"
+    RESET = "operator reset"
+    BLOCKED = "not ready"
+    ENGAGE = "operator engaged"
+    ARM = "operator armed"
 
 
-TRANSITIONS: dict[tuple[Mode, Event], Mode] = {
-    (Mode.STANDBY, Event.ALL_READY): Mode.READY,
-    (Mode.READY, Event.NOT_READY): Mode.STANDBY,
-    (Mode.READY, Event.ENGAGE_REQUESTED): Mode.ENGAGED,
-    (Mode.READY, Event.DISENGAGE_REQUESTED): Mode.STANDBY,
-    (Mode.ENGAGED, Event.EMERGENCY_STOP): Mode.FAULT,
-    (Mode.ENGAGED, Event.ROBOT_FAULT): Mode.SAFE_STOP,
-    (Mode.ENGAGED, Event.STATE_LOST): Mode.SAFE_STOP,
-    (Mode.ENGAGED, Event.COMMAND_FAILED): Mode.SAFE_STOP,
-    (Mode.ENGAGED, Event.COMMAND_LOST): Mode.SAFE_STOP,
-    (Mode.ENGAGED, Event.TICK_GAP): Mode.SAFE_STOP,
-    (Mode.ENGAGED, Event.DRIVER_OVERRIDE): Mode.STANDBY,
-    (Mode.ENGAGED, Event.DISENGAGE_REQUESTED): Mode.STANDBY,
-    (Mode.SAFE_STOP, Event.EMERGENCY_STOP): Mode.FAULT,
-    (Mode.SAFE_STOP, Event.DRIVER_OVERRIDE): Mode.STANDBY,
-    (Mode.SAFE_STOP, Event.RESET_REQUESTED): Mode.STANDBY,
-    (Mode.FAULT, Event.RESET_REQUESTED): Mode.STANDBY,
+REACTIONS: Mapping[Cause, Trigger] = {
+    Cause.ROBOTS_EMERGENCY_STOP: Trigger.GIVE_UP,
+    Cause.ROBOTS_STOPPED: Trigger.GIVE_UP,
+    Cause.BUS_DOWN: Trigger.GIVE_UP,
+    Cause.BUS_OFF: Trigger.GIVE_UP,
+    Cause.BUS_BLOCKED: Trigger.GIVE_UP,
+    Cause.SECOND_SENDER: Trigger.GIVE_UP,
+    Cause.WATCHDOG_SILENT: Trigger.STOP,
+    Cause.ROBOT_FAULT: Trigger.STOP,
+    Cause.ROBOT_MISSES_COMMANDS: Trigger.STOP,
+    Cause.ROBOTS_NOT_ENGAGED: Trigger.STOP,
+    Cause.TICK_GAP: Trigger.STOP,
+    Cause.MESSAGE_MISSING: Trigger.STOP,
+    Cause.MESSAGE_INVALID: Trigger.STOP,
+    Cause.NAVIGATION_FROZEN: Trigger.STOP,
+    Cause.NAVIGATION_COARSE: Trigger.STOP,
+    Cause.SPEED_IMPLAUSIBLE: Trigger.STOP,
+    Cause.POSITION_IMPLAUSIBLE: Trigger.STOP,
+    Cause.YAW_RATE_IMPLAUSIBLE: Trigger.STOP,
+    Cause.STEERING_IMPLAUSIBLE: Trigger.STOP,
+    Cause.STEERING_NOT_FOLLOWING: Trigger.STOP,
+    Cause.COMMAND_FAILED: Trigger.STOP,
+    Cause.COMMAND_LOST: Trigger.STOP,
+    Cause.COMMAND_INVALID: Trigger.STOP,
+    Cause.SECOND_CONTROLLER: Trigger.STOP,
+    Cause.LATENCY: Trigger.STOP_GENTLY,
+    Cause.OVERSPEED: Trigger.STOP_GENTLY,
+    Cause.SELECTOR_NOT_IN_DRIVE: Trigger.STOP_GENTLY,
+    Cause.OPERATOR_STOP: Trigger.STOP_GENTLY,
+    Cause.DRIVER_STEERS: Trigger.HAND_OVER,
+    Cause.DRIVER_BRAKES: Trigger.HAND_OVER,
+    Cause.DRIVER_ACCELERATES: Trigger.HAND_OVER,
+    Cause.DRIVER_OVERRIDE: Trigger.HAND_OVER,
+    Cause.OPERATOR_DISENGAGE: Trigger.HAND_OVER,
 }
+"""What each cause asks for."""
+
+TRANSITIONS: Mapping[tuple[Mode, Trigger], Mode] = {
+    (Mode.SILENT, Trigger.ARM): Mode.READY,
+    (Mode.SILENT, Trigger.RESET): Mode.STANDBY,  # robots that a gateway has left in a stop end it for a Disarm only
+    (Mode.STANDBY, Trigger.ARM): Mode.READY,
+    (Mode.READY, Trigger.GIVE_UP): Mode.STANDBY,
+    (Mode.READY, Trigger.STOP): Mode.STANDBY,
+    (Mode.READY, Trigger.STOP_GENTLY): Mode.STANDBY,
+    (Mode.READY, Trigger.HAND_OVER): Mode.STANDBY,
+    (Mode.READY, Trigger.BLOCKED): Mode.STANDBY,
+    (Mode.READY, Trigger.ENGAGE): Mode.ENGAGED,
+    (Mode.ENGAGED, Trigger.GIVE_UP): Mode.FAULT,
+    (Mode.ENGAGED, Trigger.STOP): Mode.SAFE_STOP,
+    (Mode.ENGAGED, Trigger.STOP_GENTLY): Mode.COMFORT_STOP,
+    (Mode.ENGAGED, Trigger.HAND_OVER): Mode.STANDBY,
+    (Mode.COMFORT_STOP, Trigger.GIVE_UP): Mode.FAULT,
+    (Mode.COMFORT_STOP, Trigger.STOP): Mode.SAFE_STOP,
+    (Mode.COMFORT_STOP, Trigger.HAND_OVER): Mode.STANDBY,
+    (Mode.COMFORT_STOP, Trigger.RESET): Mode.STANDBY,
+    (Mode.SAFE_STOP, Trigger.GIVE_UP): Mode.FAULT,
+    (Mode.SAFE_STOP, Trigger.HAND_OVER): Mode.STANDBY,
+    (Mode.SAFE_STOP, Trigger.RESET): Mode.STANDBY,
+    (Mode.FAULT, Trigger.RESET): Mode.STANDBY,
+}
+
+DRIVING = (Mode.ENGAGED, Mode.COMFORT_STOP, Mode.SAFE_STOP)
+"""In these the gateway moves the car."""
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """A change of mode and why."""
+    """A change of mode and why.
+
+    Args:
+        finding: what was found; None when nobody but the operator caused it.
+    """
 
     t_ns: int
     before: Mode
     after: Mode
-    event: Event
-    detail: str
+    trigger: Trigger
+    finding: Finding | None
 
     @property
     def reason(self) -> str:
         """One line for people."""
-        return f"{self.event.value}: {self.detail}" if self.detail else self.event.value
+        return self.trigger.value if self.finding is None else str(self.finding)
 
 
 class ModeMachine:
-    """Applies the table."""
+    """Applies the tables."""
 
     def __init__(self) -> None:
-        self.mode = Mode.STANDBY
+        self.mode = Mode.SILENT
         self.reason = "started"
 
-    def update(self, now_ns: int, events: dict[Event, str]) -> Transition | None:
-        """Take at most one transition for the events of this tick, each with a detail for people."""
-        for event in Event:
-            if event in events and (after := TRANSITIONS.get((self.mode, event))) is not None:
-                transition = Transition(now_ns, self.mode, after, event, events[event])
+    def update(self, now_ns: int, findings: Sequence[Finding], requests: frozenset[Trigger] = frozenset()) -> Transition | None:
+        """Take at most one transition.
+
+        Args:
+            findings: what would end an engagement now.
+            requests: what the operator asked for and may have, and BLOCKED when READY cannot be kept.
+        """
+        happened: dict[Trigger, Finding | None] = dict.fromkeys(requests)
+        for finding in sorted(findings, key=lambda finding: _ORDER[finding.cause], reverse=True):
+            happened[REACTIONS[finding.cause]] = finding  # the gravest of a trigger stays
+        for trigger in Trigger:
+            if trigger in happened and (after := TRANSITIONS.get((self.mode, trigger))) is not None:
+                transition = Transition(now_ns, self.mode, after, trigger, happened[trigger])
                 self.mode, self.reason = after, transition.reason
                 return transition
         return None
+
+
+_ORDER = {cause: k for k, cause in enumerate(Cause)}

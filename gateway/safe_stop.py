@@ -6,7 +6,7 @@ deceleration is built up at a limited jerk and held until standstill, then the b
 
 from dataclasses import dataclass
 
-from gateway.limits import LimitProfile
+from gateway.limits import StopGrade
 from gateway.messages import HORIZON_STEPS, PLAN_PERIOD_NS, ControlCommand
 
 STANDSTILL_MPS = 0.1
@@ -42,13 +42,13 @@ class SafeStop:
     """
 
     def __init__(
-        self, start_ns: int, last_command: ControlCommand | None, steer_rad: float, deceleration_mps2: float, profile: LimitProfile
+        self, start_ns: int, last_command: ControlCommand | None, steer_rad: float, deceleration_mps2: float, grade: StopGrade
     ) -> None:
         self._start_ns = start_ns
         self._last_command = last_command
         self._steer_rad = steer_rad
         self._initial_deceleration_mps2 = max(0.0, deceleration_mps2)
-        self._profile = profile
+        self._grade = grade
         self._is_standing = False
 
     def demand(self, now_ns: int, vx_mps: float) -> StopDemand:
@@ -57,7 +57,7 @@ class SafeStop:
         elapsed_s = (now_ns - self._start_ns) * 1e-9
         deceleration_mps2 = max(
             self._initial_deceleration_mps2,
-            min(self._initial_deceleration_mps2 + self._profile.stop_jerk_mps3 * elapsed_s, self._profile.stop_deceleration_mps2),
+            min(self._initial_deceleration_mps2 + self._grade.jerk_mps3 * elapsed_s, self._grade.deceleration_mps2),
         )
         steer_rad = self._steer_rad
         if self._last_command is not None:

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 
+from dbc.health import LinkHealth
 from gateway.core import GatewayCore, StepOutput
 from gateway.telemetry import Sample, StateSample, StatusSample
 
@@ -20,12 +21,26 @@ class Process:
         step_cpu_ms: CPU time of the step [ms].
         dead_buses: networks whose bus refuses to deliver or to accept frames.
         frames_dropped: received frames that the core was not shown, by cause.
+        frames_unsent: frames that were to be sent and were not, by cause.
+        links: health of the bus of every network.
+        ticks_unrecorded, record_problem: see `gateway.recorder.RecorderStatus`.
+        realtime: what the control thread asked of the machine, and what it was refused.
+        hashes: SHA-256 of all that it works with.
     """
 
     ticks_late: int = 0
     step_cpu_ms: float = 0.0
     dead_buses: Sequence[str] = ()
     frames_dropped: Mapping[str, int] = field(default_factory=dict)
+    frames_unsent: Mapping[str, int] = field(default_factory=dict)
+    links: Mapping[str, LinkHealth] = field(default_factory=dict)
+    ticks_unrecorded: int = 0
+    record_problem: str = ""
+    realtime: Mapping[str, str] = field(default_factory=dict)
+    hashes: Mapping[str, str] = field(default_factory=dict)
+
+
+VIRTUAL = Process()
 
 
 class GatewaySampler:
@@ -35,14 +50,18 @@ class GatewaySampler:
         self._state_seq = count()
         self._status_seq = count()
 
-    def sample(self, core: GatewayCore, output: StepOutput, now_ns: int, process: Process) -> list[Sample]:
+    def sample(self, core: GatewayCore, output: StepOutput, now_ns: int, process: Process = VIRTUAL) -> list[Sample]:
         """Samples of this step, possibly none."""
         samples: list[Sample] = []
         if core.ticks % STATE_EVERY_TICKS == 0 or output.transition is not None:
             samples.append(_state(next(self._state_seq), core, output, now_ns))
-        if core.ticks % STATUS_EVERY_TICKS == 0 or output.transition is not None:
+        if self.is_status_due(core, output):
             samples.append(_status(next(self._status_seq), core, now_ns, process))
         return samples
+
+    def is_status_due(self, core: GatewayCore, output: StepOutput) -> bool:
+        """Whether this step's samples tell of the process."""
+        return core.ticks % STATUS_EVERY_TICKS == 0 or output.transition is not None
 
 
 def _state(seq: int, core: GatewayCore, output: StepOutput, now_ns: int) -> StateSample:
@@ -83,4 +102,10 @@ def _status(seq: int, core: GatewayCore, now_ns: int, process: Process) -> Statu
         ticks_late=process.ticks_late,
         step_cpu_ms=process.step_cpu_ms,
         dead_buses=list(process.dead_buses),
+        buses={network: health.state.value for network, health in process.links.items()},
+        frames_unsent=dict(process.frames_unsent),
+        ticks_unrecorded=process.ticks_unrecorded,
+        record_problem=process.record_problem,
+        realtime=dict(process.realtime),
+        hashes=dict(process.hashes),
     )

@@ -1,7 +1,8 @@
 """Judgement on every frame received, and on those that are missing.
 
 A frame counts only when the DBC knows it, its length and ranges fit, and its end-to-end protection holds. All else is
-counted by cause and ignored: bad data and no data are the same thing, so that one freshness check per message covers both.
+counted by cause and ignored at once: bad data and no data are the same thing. A message of which too many frames are bad
+is invalid until it has been good for a while, even though enough good ones come in between.
 """
 
 from collections import Counter
@@ -10,30 +11,86 @@ from collections.abc import Iterable, Sequence
 from dbc.catalogue import Catalogue, DecodeError, MessageSpec
 from dbc.e2e import E2EReceiver
 from dbc.frame import CanFrame
+from gateway.causes import Cause, Finding
+
+WINDOW_FRAMES = 10
+MAX_BAD_FRAMES = 2
+"""Bad frames among the last `WINDOW_FRAMES` of a message that are only counted; one more, and the message is invalid."""
+RECOVERY_NS = 1_000_000_000
+"""How long an invalid message has to be good before it counts again [ns]."""
+
+_WINDOW_MASK = (1 << WINDOW_FRAMES) - 1
+_MS_PER_NS = 1e-6
+
+
+class MessageWatch:
+    """What is remembered of one needed message.
+
+    Attributes:
+        spec: its entry in the catalogue.
+        last_good_ns: arrival of the newest good frame [ns]; None when there was none.
+    """
+
+    def __init__(self, spec: MessageSpec) -> None:
+        self.spec = spec
+        self.last_good_ns: int | None = None
+        self._receiver = None if spec.e2e_data_id is None else E2EReceiver(spec.e2e_data_id)
+        self._window = 0
+        self._last_bad_ns = 0
+        self._is_invalid = False
+
+    def reject_cause(self, frame: CanFrame) -> str | None:
+        """Why a frame must not be decoded; None when it may."""
+        if len(frame.data) != self.spec.length_bytes:
+            return "length"
+        if self._receiver is not None and not (status := self._receiver.check(frame.data)).is_usable:
+            return status.value
+        return None
+
+    def note(self, t_ns: int, is_good: bool) -> None:
+        """Remember what became of a frame."""
+        self._window = (self._window << 1 | (not is_good)) & _WINDOW_MASK
+        if is_good:
+            self.last_good_ns = t_ns
+            return
+        self._last_bad_ns = t_ns
+        self._is_invalid = self._is_invalid or self.bad_frames > MAX_BAD_FRAMES
+
+    @property
+    def bad_frames(self) -> int:
+        """Bad ones among the last `WINDOW_FRAMES`."""
+        return self._window.bit_count()
+
+    def finding(self, now_ns: int) -> Finding | None:
+        """What is wrong with the message now."""
+        spec = self.spec
+        age_ns = spec.timeout_ns + 1 if self.last_good_ns is None else now_ns - self.last_good_ns
+        if age_ns > spec.timeout_ns:
+            return Finding(Cause.MESSAGE_MISSING, age_ns * _MS_PER_NS, spec.timeout_ns * _MS_PER_NS, spec.name)
+        if self._is_invalid and now_ns - self._last_bad_ns <= RECOVERY_NS:
+            return Finding(Cause.MESSAGE_INVALID, self.bad_frames, MAX_BAD_FRAMES, spec.name)
+        self._is_invalid = False
+        return None
 
 
 class Supervisor:
-    """Accepts or rejects frames and watches the age of the messages it is told to need.
+    """Accepts or rejects frames and watches the messages it is told to need.
 
     Args:
         needed: names of the messages whose absence matters and whose content is decoded; others are ignored.
+        node: whose messages nobody else may send.
 
     Attributes:
         received: frames seen.
         rejected: count by cause.
     """
 
-    def __init__(self, catalogue: Catalogue, needed: Iterable[str]) -> None:
+    def __init__(self, catalogue: Catalogue, needed: Iterable[str], node: str = "GW") -> None:
         self._catalogue = catalogue
-        self._needed: dict[int, MessageSpec] = {
-            catalogue.by_name[name].arbitration_id: catalogue.by_name[name] for name in needed
-        }
-        self._receivers = {
-            arbitration_id: E2EReceiver(spec.e2e_data_id)
-            for arbitration_id, spec in self._needed.items()
-            if spec.e2e_data_id is not None
-        }
-        self._last_good_ns: dict[str, int] = {}
+        self._watches = {catalogue.by_name[name].arbitration_id: MessageWatch(catalogue.by_name[name]) for name in needed}
+        self._by_name = {watch.spec.name: watch for watch in self._watches.values()}
+        self._own = {arbitration_id: spec for arbitration_id, spec in catalogue.by_id.items() if spec.sender == node}
+        self._impostor: Finding | None = None
         self.received = 0
         self.rejected: Counter[str] = Counter()
 
@@ -42,42 +99,35 @@ class Supervisor:
         values: dict[str, dict[str, float]] = {}
         self.received += len(frames)
         for frame in frames:
-            spec = self._needed.get(frame.arbitration_id)
-            if spec is None:
-                if frame.arbitration_id not in self._catalogue.by_id:
-                    self.rejected["unknown id"] += 1
+            watch = self._watches.get(frame.arbitration_id)
+            if watch is None:
+                self._note_stranger(frame)
                 continue
-            cause = self._reject_cause(spec, frame)
+            cause = watch.reject_cause(frame)
             if cause is None:
                 try:
-                    values[spec.name] = self._catalogue.decode(spec, frame)
-                    self._last_good_ns[spec.name] = frame.t_ns
-                    continue
+                    values[watch.spec.name] = self._catalogue.decode(watch.spec, frame)
                 except DecodeError:
                     cause = "range"
-            self.rejected[f"{spec.name}: {cause}"] += 1
+            watch.note(frame.t_ns, cause is None)
+            if cause is not None:
+                self.rejected[f"{watch.spec.name}: {cause}"] += 1
         return values
 
-    def _reject_cause(self, spec: MessageSpec, frame: CanFrame) -> str | None:
-        if len(frame.data) != spec.length_bytes:
-            return "length"
-        receiver = self._receivers.get(frame.arbitration_id)
-        if receiver is not None and not (status := receiver.check(frame.data)).is_usable:
-            return status.value
-        return None
+    def _note_stranger(self, frame: CanFrame) -> None:
+        own = self._own.get(frame.arbitration_id)
+        if own is not None:
+            self.rejected[f"{own.name}: second sender"] += 1
+            self._impostor = Finding(Cause.SECOND_SENDER, self.rejected[f"{own.name}: second sender"], 0, own.name)
+        elif frame.arbitration_id not in self._catalogue.by_id:
+            self.rejected["unknown id"] += 1
 
-    def arrival_ns(self, name: str) -> int:
-        """Time at which the newest good frame of a needed message arrived [ns].
+    def arrival_ns(self, name: str) -> int | None:
+        """Time at which the newest good frame of a needed message arrived [ns]; None when there has been none."""
+        return self._by_name[name].last_good_ns
 
-        Raises:
-            KeyError: there has been none.
-        """
-        return self._last_good_ns[name]
-
-    def missing(self, now_ns: int) -> list[str]:
-        """Needed messages without a good frame for longer than their timeout in the DBC."""
-        return [
-            spec.name
-            for spec in self._needed.values()
-            if now_ns - self._last_good_ns.get(spec.name, now_ns - spec.timeout_ns - 1) > spec.timeout_ns
-        ]
+    def findings(self, now_ns: int) -> list[Finding]:
+        """What is wrong with the messages now, and, once, that somebody else has sent ours."""
+        impostor, self._impostor = self._impostor, None
+        found = [finding for watch in self._watches.values() if (finding := watch.finding(now_ns)) is not None]
+        return found if impostor is None else [impostor, *found]

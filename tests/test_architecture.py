@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ALLOWED_IMPORTS = {
     "dbc": (),
     "gateway": ("dbc",),
-    "controller": ("dbc", "gateway.messages", "gateway.telemetry", "gateway.channel", "gateway.loop"),
+    "controller": ("dbc", "gateway.messages", "gateway.telemetry", "gateway.channel", "gateway.loop", "gateway.journal", "gateway.record"),
     "vehicle_emulator": ("dbc", "gateway.telemetry"),
     "visualiser": ("dbc.errors", "gateway.telemetry"),
     "xil": ("dbc", "gateway", "controller", "vehicle_emulator", "visualiser"),
@@ -26,7 +26,7 @@ ALLOWED_IMPORTS = {
 
 # Modules that decide: same input, same output, in virtual time as in real time.
 PURE_MODULES = {
-    "dbc": ("frame", "catalogue", "packing", "e2e", "vehicle", "section", "multibody"),
+    "dbc": ("frame", "catalogue", "packing", "e2e", "database", "mapping", "lint", "difference", "vehicle", "section", "multibody"),
     "gateway": (
         *("messages", "codec", "supervision", "commands", "conditions", "modes"),
         *("limits", "actuation", "safe_stop", "core"),

@@ -29,9 +29,11 @@ _TABLE_PERIOD_S = 0.25
 _LINE_PERIOD_S = 1.0
 _SOLVE_BUDGET_MS = 40.0  # one control cycle
 _MODE_STYLES = {
+    "SILENT": "bold white on grey37",
     "STANDBY": "bold white on grey37",
     "READY": "bold white on blue",
     "ENGAGED": "bold black on green",
+    "COMFORT_STOP": "bold black on yellow",
     "SAFE_STOP": "bold black on yellow",
     "FAULT": "bold white on red",
 }

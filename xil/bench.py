@@ -76,6 +76,10 @@ def to_table(result: dict[str, Any]) -> Table:
     return table
 
 
+_STEPS = {Mode.SILENT: Operation.ARM, Mode.READY: Operation.ENGAGE}
+"""What the operator asks for, by the mode."""
+
+
 def _record(catalogue: Catalogue, vehicle: Vehicle, seconds: float) -> list[Tick]:
     """Drive until the gateway has been engaged for `seconds`, and keep all that it was given."""
     emulator = Emulator(EmulatorSetup(vehicle, StartPose(speed_mps=START_SPEED_MPS), seed=1), catalogue, START_NS)
@@ -89,7 +93,8 @@ def _record(catalogue: Catalogue, vehicle: Vehicle, seconds: float) -> list[Tick
         to_gateway += emulator.step(now_ns, to_car)
         to_car = []
         if now_ns % TICK_NS == 0:
-            request = OperatorRequest(3, now_ns, Operation.ENGAGE) if gateway.mode is Mode.READY else None
+            operation = _STEPS.get(gateway.mode)
+            request = None if operation is None else OperatorRequest(3, now_ns, operation, now_ns)
             tick = Tick(now_ns, to_gateway, _command(now_ns, gateway.ticks), request)
             to_car, to_gateway = gateway.step(now_ns, tick.frames, tick.command, request).frames, []
             ticks.append(tick)
@@ -102,7 +107,7 @@ def _command(now_ns: int, state_seq: int) -> ControlCommand | None:
         return None
     steer_rad = STEER_AMPLITUDE_RAD * math.sin(2.0 * math.pi * now_ns * 1e-9 / STEER_PERIOD_S)
     plan = (steer_rad,) * HORIZON_STEPS, (0.1,) * HORIZON_STEPS
-    return ControlCommand(2, now_ns, state_seq, now_ns, CommandStatus.OK, 0, steer_rad, 0.1, *plan)
+    return ControlCommand(2, now_ns, state_seq, now_ns, CommandStatus.OK, 0, 0.0, 0.0, steer_rad, 0.1, *plan)
 
 
 def _replay(catalogue: Catalogue, vehicle: Vehicle, ticks: list[Tick]) -> list[float]:

@@ -11,7 +11,8 @@ from typing import IO, Self
 import can
 
 from dbc.frame import CanFrame
-from vehicle_emulator.bus.bits import INTERMISSION_BITS, frame_bits
+from dbc.frame_length import INTERMISSION_BITS
+from vehicle_emulator.bus.bits import frame_bits
 from vehicle_emulator.bus.frame import BusFrame
 
 _NS_PER_S = 1_000_000_000
@@ -21,7 +22,11 @@ _POLL_S = 0.02
 
 
 class BusLog:
-    """Writes frames, each with its time stamp and the channel of its bus; several threads may write."""
+    """Writes frames, each with its time stamp and the channel of its bus; several threads may write.
+
+    Attributes:
+        frames: frames written so far.
+    """
 
     def __init__(self, path: Path) -> None:
         self._file: IO[str] = path.open("w", encoding="ascii")
@@ -35,6 +40,11 @@ class BusLog:
         with self._lock:
             self._file.write(line)
             self.frames += 1
+
+    def flush(self) -> None:
+        """Give what is buffered to the system, so that it outlives this process."""
+        with self._lock:
+            self._file.flush()
 
     def close(self) -> None:
         """Write out what is buffered."""
@@ -74,6 +84,7 @@ class BusListener:
             except (can.CanError, OSError):
                 return  # the bus has gone; whoever runs it says so
             if message is None:
+                self._log.flush()
                 time.sleep(_POLL_S)
             elif not (message.is_error_frame or message.is_remote_frame):
                 self._log.write(channel, CanFrame(message.arbitration_id, bytes(message.data), round(message.timestamp * _NS_PER_S)))

@@ -15,15 +15,17 @@ from dbc.errors import SetupFailure, UserMistake
 from dbc.realtime import BUS_PRIORITY, become_realtime
 from dbc.vehicle import FOCUS
 from gateway.telemetry import DEFAULT_BASE_PORT
-from xil import cli_bench, cli_live
+from xil import cli_bench, cli_dbc, cli_gateway, cli_live, cli_record
 from xil.cli_common import (
     EXIT_FAIL,
     EXIT_INTERRUPTED,
-    EXIT_SETUP,
-    EXIT_USER,
+    ControlOption,
+    DbcOption,
     JsonOption,
+    KeyOption,
     PortOption,
     VehicleOption,
+    exit_code_of,
     run_daemon,
     show,
     stop_on_signal,
@@ -41,7 +43,6 @@ BusOption = Annotated[str, typer.Option("--bus", help="auto, emulated, socketcan
 NavigationBusOption = Annotated[
     str | None, typer.Option("--navigation-bus", help="the same for the navigation system; default: as --bus, or a second emulated bus")
 ]
-DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
 PlantOption = Annotated[str, typer.Option("--plant", help="emulated car: multibody, bicycle, commonroad or fmu:FILE")]
 LiftedOption = Annotated[bool, typer.Option("--lifted/--on-the-road", help="begin with the car on the lift, wheels in the air")]
 SolverOption = Annotated[
@@ -63,7 +64,7 @@ def main() -> None:
     except (UserMistake, SetupFailure) as error:
         for line in str(error).splitlines():
             print(f"xilgate: {line}", file=sys.stderr)
-        sys.exit(EXIT_USER if isinstance(error, UserMistake) else EXIT_SETUP)
+        sys.exit(exit_code_of(error))
 
 
 @app.command()
@@ -114,42 +115,23 @@ def drive(
 
 
 @app.command()
-def gateway(
-    bus: Annotated[str, typer.Option("--bus", help="python-can name of the robots' bus, for example socketcan:can0")] = "socketcan:can0",
-    navigation_bus: Annotated[str | None, typer.Option("--navigation-bus", help="that of the navigation system; default: the same")] = None,
-    dbc: DbcOption = DBC_FILES,
-    vehicle: VehicleOption = FOCUS,
-    gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
-    controller_socket: Annotated[str, typer.Option(help="control socket of the controller")] = "/tmp/xilgate-controller.sock",
-    telemetry_port: PortOption = DEFAULT_BASE_PORT,
-) -> None:
-    """The gateway process: the only one that writes to the car's buses."""
-    from dbc.link import bus_names  # noqa: PLC0415
-
-    buses = bus_names(bus, navigation_bus)
-    run_daemon(
-        "gateway.app",
-        lambda m: m.GatewayOptions(buses, tuple(dbc), vehicle, gateway_socket, controller_socket, telemetry_port),
-    )
-
-
-@app.command()
 def controller(
     reference: Annotated[Path, typer.Option(help="path to follow, CSV")],
     vehicle: VehicleOption = FOCUS,
     solver: SolverOption = None,
-    gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
-    controller_socket: Annotated[str, typer.Option(help="control socket of the controller")] = "/tmp/xilgate-controller.sock",
+    control: ControlOption = None,
+    key: KeyOption = None,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
 ) -> None:
     """The controller process: planner and NMPC at 25 Hz."""
+    from gateway.channel import control_path  # noqa: PLC0415
+
     run_daemon(
         "controller.app",
         lambda m: m.ControllerOptions(
             reference_csv=reference,
             vehicle_path=vehicle,
-            gateway_socket=gateway_socket,
-            controller_socket=controller_socket,
+            control=control_path(control, key),
             solver=solver or m.DEFAULT_SOLVER,
             telemetry_base_port=telemetry_port,
         ),
@@ -235,5 +217,8 @@ def doctor(as_json: JsonOption = False) -> None:
     show(examination.as_data(checks) if as_json else examination.as_table(checks), as_json)
 
 
+app.add_typer(cli_gateway.driving)
 app.add_typer(cli_live.live)
 app.add_typer(cli_bench.making)
+app.add_typer(cli_record.records)
+app.add_typer(cli_dbc.tools, name="dbc")

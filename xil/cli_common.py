@@ -13,10 +13,17 @@ from typing import Annotated, Any
 
 import typer
 
+from dbc.errors import SetupFailure, UserMistake
+
 EXIT_FAIL, EXIT_USER, EXIT_SETUP, EXIT_INTERRUPTED = 1, 2, 3, 130
 
+DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
 PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
+ControlOption = Annotated[
+    Path | None, typer.Option("--control", help="directory of the control sockets and their key; default: one of the user's own")
+]
+KeyOption = Annotated[Path | None, typer.Option("--key", help="key file of the rig; default: the key in the directory of the sockets")]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object instead of a table")]
 
 
@@ -35,6 +42,11 @@ def run_daemon(module: str, make_options: Callable[[Any], object]) -> None:
     daemon = importlib.import_module(module)
     with stop_on_signal() as stop:
         daemon.run(make_options(daemon), stop)
+
+
+def exit_code_of(error: UserMistake | SetupFailure) -> int:
+    """Exit code of a command that such an error ends."""
+    return EXIT_USER if isinstance(error, UserMistake) else EXIT_SETUP
 
 
 def progress(text: str) -> None:

@@ -1,13 +1,13 @@
-"""Commands that talk to what runs: operate, watch, object, lift, params, fault."""
+"""Commands that talk to what runs: operate, make-key, watch, object, lift, params, fault."""
 
 from enum import StrEnum
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dbc.errors import SetupFailure
 from gateway.telemetry import DEFAULT_BASE_PORT
-from xil.cli_common import JsonOption, PortOption, as_json_text, run_daemon, show, stop_on_signal
+from xil.cli_common import EXIT_FAIL, ControlOption, JsonOption, KeyOption, PortOption, as_json_text, run_daemon, show, stop_on_signal
 
 live = typer.Typer()
 params = typer.Typer(help="Look at and change the parameters of a running controller.", no_args_is_help=True)
@@ -19,8 +19,10 @@ live.add_typer(fault, name="fault")
 class OperationName(StrEnum):
     """What an operator can ask for."""
 
+    ARM = "arm"
     ENGAGE = "engage"
     DISENGAGE = "disengage"
+    STOP = "stop"
     RESET = "reset"
 
 
@@ -34,17 +36,32 @@ class Movement(StrEnum):
 @live.command()
 def operate(
     operation: Annotated[OperationName, typer.Argument(help="what to ask of the gateway")],
-    gateway_socket: Annotated[str, typer.Option(help="control socket of the gateway")] = "/tmp/xilgate-gateway.sock",
+    control: ControlOption = None,
+    key: KeyOption = None,
+    as_json: JsonOption = False,
 ) -> None:
-    """Ask a running gateway to engage, disengage or reset; `xilgate watch` shows what it makes of it."""
-    from gateway.channel import Channel  # noqa: PLC0415
-    from gateway.messages import Operation, OperatorRequest  # noqa: PLC0415
-    from gateway.telemetry import new_boot_id  # noqa: PLC0415
+    """Ask a running gateway for an operation and tell its answer: granted, or every condition that is not met (exit code 1)."""
+    from gateway.channel import control_path, operator_client  # noqa: PLC0415
+    from gateway.messages import Operation  # noqa: PLC0415
 
-    with Channel(None, gateway_socket) as channel:
-        channel.send(OperatorRequest(new_boot_id(), 1, Operation[operation.name]))
-        if channel.unsent:
-            raise SetupFailure(f"no gateway listens on {gateway_socket}")
+    with operator_client(control_path(control, key)) as client:
+        reply = client.ask(Operation[operation.name])
+    if as_json:
+        content = {"operation": operation.value, "granted": not reply.refusals, "mode": reply.mode.name, "refusals": reply.refusals}
+        print(as_json_text(content))
+    else:
+        print("\n".join(f"refused: {refusal}" for refusal in reply.refusals) or f"granted: {reply.mode.name}")
+    if reply.refusals:
+        raise typer.Exit(EXIT_FAIL)
+
+
+@live.command("make-key")
+def make_key(file: Annotated[Path, typer.Argument(metavar="FILE", help="not there yet; its mode will be 0600")]) -> None:
+    """Make the key of a rig: who can read it can command its gateway."""
+    from gateway import keys  # noqa: PLC0415
+
+    keys.make_key(file)
+    print(f"{file}: new key")
 
 
 @live.command()

@@ -30,7 +30,7 @@ from vehicle_emulator.faults.targets import check
 from xil.bus import choose
 from xil.buslog import recorded_load
 from xil.injected import injected_faults
-from xil.lockstep import START_NS, LockstepRun
+from xil.lockstep import START_NS, LockstepRun, journals_of
 from xil.metrics import Verdict, evaluate
 from xil.realtime import RealtimeRun
 from xil.recording import Recording
@@ -41,7 +41,7 @@ from xil.summary import RunFacts, build_summary
 
 SOLVER_OF_STAGE = {Stage.MIL: "casadi-vm"} | dict.fromkeys((Stage.SIL, Stage.HIL, Stage.VEHIL), DEFAULT_SOLVER)
 """MiL runs the controller as it was modelled; from SiL on it is the compiled library."""
-OUTCOMES = ("summary.json", "report.html", "bus.log")
+OUTCOMES = ("summary.json", "report.html", "bus.log", "gateway-*.journal", "controller-*.journal")
 """What a run concludes with; the next one in the same directory starts without them."""
 
 
@@ -149,8 +149,8 @@ def _run(setup: RunSetup, options: DriveOptions, display: Display) -> Verdict:
 def _in_virtual_time(setup: RunSetup, display: Display) -> _Driven:
     recording = Recording(START_NS)
     solver = make_solver(setup.solver, setup.vehicle.model, OcpOptions(model=DRIVE_MODEL), display.announce)
-    with _deferred_interrupt() as interrupted:
-        run = LockstepRun(setup, solver, recording, display.progress, interrupted.is_set)
+    with _deferred_interrupt() as interrupted, journals_of(setup) as journals:
+        run = LockstepRun(setup, solver, recording, display.progress, interrupted.is_set, journals=journals)
         start_s = time.monotonic()
         interruption = run.drive()
         wall_s = time.monotonic() - start_s
@@ -177,8 +177,8 @@ def _sole_use_of(directory: Path) -> Iterator[None]:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise UserMistake(f"run directory {directory} is in use by another run; choose another with --out") from None
-        for name in OUTCOMES:
-            (directory / name).unlink(missing_ok=True)
+        for path in [path for pattern in OUTCOMES for path in directory.glob(pattern)]:
+            path.unlink(missing_ok=True)
         yield
     finally:
         os.close(descriptor)

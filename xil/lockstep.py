@@ -8,20 +8,26 @@ transmission. Nothing reads a clock, so that a seed determines every frame.
 
 from collections.abc import Callable
 
+from controller.journal import RecordedNmpc
 from controller.nmpc import Nmpc, NmpcOptions
 from controller.objects import nearest, report_of
+from controller.record import controller_session
 from controller.samples import command_sample, plan_sample
 from controller.solver import Solver
 from dbc.errors import SetupFailure
 from dbc.frame import CanFrame
 from gateway.core import TICK_NS, GatewayCore
+from gateway.journal import StepArguments
+from gateway.limits import PROVING_GROUND
 from gateway.messages import PLAN_PERIOD_NS, ControlCommand, OperatorRequest
+from gateway.record.session import gateway_session
 from gateway.samples import GatewaySampler, Process
 from gateway.telemetry import StateSample
 from vehicle_emulator.app import fault_sample, world_sample
 from vehicle_emulator.emulator import STEP_NS, Emulator
 from xil.buslog import BusLog
 from xil.course import Pose
+from xil.journals import Journals
 from xil.operator import Ending, Operator
 from xil.recording import Recording
 from xil.setup import RunSetup
@@ -38,11 +44,21 @@ _GATEWAY_BOOT_ID, _CONTROLLER_BOOT_ID, _OPERATOR_BOOT_ID = 1, 2, 3
 Progress = Callable[[StateSample | None], None]
 
 
+def journals_of(setup: RunSetup) -> Journals:
+    """The journals of a run, in its directory, in which the inputs of the run are already."""
+    return Journals(
+        setup.directory,
+        gateway_session(_GATEWAY_BOOT_ID, PROVING_GROUND, setup.dbc_paths, setup.vehicle_path, {"stage": setup.stage.value}),
+        controller_session(_CONTROLLER_BOOT_ID, setup.solver, None, setup.reference_csv, setup.vehicle_path),
+    )
+
+
 class LockstepRun:
     """One run in virtual time; `drive` does it.
 
     Args:
         options: of the controller; None for what it drives with otherwise.
+        journals: of the run, see `journals_of`; None for none.
 
     Attributes:
         driven_s: virtual time of the finished run [s].
@@ -58,6 +74,7 @@ class LockstepRun:
         is_interrupted: Callable[[], bool],
         *,
         options: NmpcOptions | None = None,
+        journals: Journals | None = None,
     ) -> None:
         pose = setup.scenario.start_pose
         self._setup = setup
@@ -69,7 +86,8 @@ class LockstepRun:
         self._world = World(setup.scenario, setup.vehicle, START_NS)
         self._objects = self._world.sample(START_NS, 0, pose)
         self._gateway = GatewayCore(setup.catalogue, setup.vehicle, _GATEWAY_BOOT_ID)
-        self._nmpc = Nmpc(solver, setup.scenario.reference(setup.vehicle), setup.vehicle, _CONTROLLER_BOOT_ID, options)
+        self._nmpc = self._make_nmpc(solver, options or NmpcOptions(), journals)
+        self._journals = journals
         self._operator = Operator(setup.scenario.time_limit_s, setup.scenario.course(setup.vehicle).is_at_end)
         self._solver_name = solver.name
         self._gateway_sampler = GatewaySampler()
@@ -78,8 +96,15 @@ class LockstepRun:
         self._command: ControlCommand | None = None
         self._request: OperatorRequest | None = None
         self._requests = 0
+        self._refusals: tuple[str, ...] = ()
         self.driven_s = 0.0
         self.bus_load: dict[str, float] = {}
+
+    def _make_nmpc(self, solver: Solver, options: NmpcOptions, journals: Journals | None) -> Nmpc:
+        vehicle, path = self._setup.vehicle, self._setup.scenario.reference(self._setup.vehicle)
+        if journals is None:
+            return Nmpc(solver, path, vehicle, _CONTROLLER_BOOT_ID, options)
+        return RecordedNmpc(solver, path, vehicle, _CONTROLLER_BOOT_ID, options, keep=journals.keep_cycle)
 
     def drive(self) -> str:
         """Drive until the operator ends the run.
@@ -104,7 +129,7 @@ class LockstepRun:
         self.bus_load = self._buses.load(now_ns)
         self.driven_s = (now_ns - START_NS) / 1e9
         if ending is Ending.NEVER_READY:
-            raise SetupFailure("the gateway never became ready: " + ", ".join(self._gateway.blockers))
+            raise SetupFailure("the gateway refuses: " + ", ".join(self._refusals))
         return "" if ending in (Ending.COMPLETED, Ending.STOPPED) else ending.value
 
     def _carry(self, now_ns: int, log: BusLog) -> None:
@@ -132,9 +157,14 @@ class LockstepRun:
                 self._recording.add(self._objects)
 
     def _step_gateway(self, now_ns: int) -> Ending | None:
-        output = self._gateway.step(now_ns, self._to_gateway, self._command, self._request)
+        arguments = StepArguments(now_ns, self._to_gateway, self._command, self._request)
+        output = self._gateway.step(*arguments)
+        if self._journals is not None:
+            self._journals.keep_step(arguments, output)
         self._to_gateway, self._command, self._request = [], None, None
         self._buses.send_from_gateway(output.frames, now_ns)
+        if output.reply is not None:
+            self._refusals = output.reply.refusals
         if now_ns % PLAN_PERIOD_NS == 0:
             objects = nearest(report_of(self._objects), now_ns, output.state.x_m, output.state.y_m)
             answer = self._nmpc.step(output.state, now_ns, objects)
@@ -153,5 +183,5 @@ class LockstepRun:
         advice = self._operator.advise(state)
         if advice.operation is not None:
             self._requests += 1
-            self._request = OperatorRequest(_OPERATOR_BOOT_ID, self._requests, advice.operation)
+            self._request = OperatorRequest(_OPERATOR_BOOT_ID, self._requests, advice.operation, state.t_ns)
         return advice.ending

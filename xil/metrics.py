@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbc.vehicle import Vehicle
+from gateway.causes import Cause
 from gateway.messages import CommandStatus, Mode
-from gateway.modes import Event
 from gateway.telemetry import CommandSample, ObjectsSample, StatusSample, WorldObject
 from xil.course import STANDSTILL_MPS, Array, Course, Outline, Projection, passage, separation_m
 from xil.recording import ModeChange, Recording
@@ -181,7 +181,7 @@ def _control(recording: Recording, drive: Trace, course: Course) -> Iterator[Met
 
     ends = [
         after for before, after in pairwise(drive.changes)
-        if before.mode == Mode.ENGAGED.name and after.t_s < drive.end_s and after.reason != Event.DISENGAGE_REQUESTED.value
+        if before.mode == Mode.ENGAGED.name and after.t_s < drive.end_s and not after.reason.startswith(Cause.OPERATOR_DISENGAGE.value.text)
     ]
     stopped = "the car stopped" if abs(drive.speed_mps[-1]) < STANDSTILL_MPS else "the car did not stop"
     failure = f"{ends[0].reason or ends[0].mode} at t = {ends[0].t_s:.2f} s, {stopped}" if ends else ""

@@ -1,4 +1,4 @@
-"""The operator of a run: engages when the gateway is ready, ends the run when it is over. Pure; fed with telemetry."""
+"""The operator of a run: arms and engages as soon as the gateway grants it, ends the run when it is over. Pure; fed with telemetry."""
 
 import math
 from collections.abc import Callable
@@ -17,6 +17,12 @@ PATIENCE_S = 8.0
 MIN_DISTANCE_M = 2.0
 """A car that has not moved this far since it was engaged has not driven yet."""
 READY_TIMEOUT_S = 20.0
+ASK_PERIOD_S = 0.1
+"""How often he asks for what was refused [s]."""
+
+
+_FIRST_STEPS = {Mode.SILENT.name: Operation.ARM, Mode.STANDBY.name: Operation.ARM, Mode.READY.name: Operation.ENGAGE}
+"""What he asks for before the car is engaged, by the mode of the gateway."""
 
 
 class Ending(Enum):
@@ -25,7 +31,7 @@ class Ending(Enum):
     COMPLETED = "the car stands for good"
     STOPPED = "the gateway ended the drive"
     TIME_LIMIT = "time limit reached"
-    NEVER_READY = "the gateway never became ready"
+    NEVER_READY = "the gateway never granted the engagement"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,7 @@ class Operator:
         self._is_at_end = is_at_end
         self._start_ns: int | None = None
         self._engaged_ns = 0
+        self._asked: tuple[Operation, int] | None = None
         self._standing_since_ns: int | None = None
         self._last_position_m = (0.0, 0.0)
         self.has_engaged = False
@@ -75,14 +82,17 @@ class Operator:
         return Advice()
 
     def _before_engagement(self, now_ns: int, state: StateSample) -> Advice:
-        if state.mode in (Mode.ENGAGED.name, Mode.SAFE_STOP.name, Mode.FAULT.name):  # a short engagement may fall between two samples
+        asks_for = _FIRST_STEPS.get(state.mode)
+        if asks_for is None:  # a short engagement may fall between two samples
             self.has_engaged, self._engaged_ns = True, now_ns
             self._last_position_m = (state.x_m, state.y_m)
             return Advice()
-        if state.mode == Mode.READY.name:
-            return Advice(Operation.ENGAGE)
-        is_overdue = now_ns - (self._start_ns or now_ns) > READY_TIMEOUT_S * 1e9
-        return Advice(ending=Ending.NEVER_READY) if is_overdue else Advice()
+        if now_ns - (self._start_ns or now_ns) > READY_TIMEOUT_S * 1e9:
+            return Advice(ending=Ending.NEVER_READY)
+        if self._asked is not None and self._asked[0] is asks_for and now_ns - self._asked[1] < ASK_PERIOD_S * 1e9:
+            return Advice()
+        self._asked = asks_for, now_ns
+        return Advice(asks_for)
 
     def _follow(self, state: StateSample) -> None:
         self.distance_m += math.dist(self._last_position_m, (state.x_m, state.y_m))

@@ -12,9 +12,9 @@ import msgspec
 
 from dbc.catalogue import NAVIGATION, ROBOTS
 from dbc.errors import SetupFailure
-from gateway.channel import Channel
-from gateway.messages import Mode, OperatorRequest
-from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, WorldSample, decode, new_boot_id, port_of
+from gateway.channel import ControlPath, OperatorClient, control_path, operator_client
+from gateway.modes import DRIVING
+from gateway.telemetry import TOPICS, Publisher, Source, StateSample, Subscriber, WorldSample, decode, port_of
 from vehicle_emulator.bus.channel import is_served
 from xil.buslog import BusListener
 from xil.course import Pose
@@ -33,7 +33,7 @@ LINGER_S = 0.3
 """Time after the end in which the last samples arrive [s]."""
 SILENCE_S = 5.0
 """A run without any state for this long is over, whatever caused it [s]."""
-MOVING_MODES = (Mode.ENGAGED.name, Mode.SAFE_STOP.name)
+MOVING_MODES = tuple(mode.name for mode in DRIVING)
 """In these the gateway drives."""
 SILENT = "no state of the car any more"
 INDISPENSABLE = {"bus", "emulator"}
@@ -55,8 +55,7 @@ class RealtimeRun:
         self._announce = announce
         self._progress = progress
         self._deaths: dict[str, Death] = {}
-        self._boot_id = new_boot_id()
-        self._requests = 0
+        self._refusals: tuple[str, ...] = ()
         self._scene = setup.scenario.scene(setup.stage, setup.vehicle, 0, 0)
         self._next_scene_ns = 0
         self._next_objects_ns = 0
@@ -75,16 +74,16 @@ class RealtimeRun:
         self._check_ports()
         topics = [topic for topic, (source, _) in TOPICS.items() if source is not Source.RUNNER]
         with contextlib.ExitStack() as stack:
-            sockets = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xilgate-")))
+            control = control_path(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="xilgate-"))))
             scene = stack.enter_context(Publisher(Source.RUNNER, setup.telemetry_base_port))
             # Without objects of its own a run leaves the port of the world to any tool that brings some.
             objects = stack.enter_context(Publisher(Source.WORLD, setup.telemetry_base_port)) if setup.scenario.objects else None
             processes = stack.enter_context(Processes(setup.directory))
             stack.enter_context(Subscriber(self._receive, topics, setup.telemetry_base_port))
-            self._bring_up(stack, processes, sockets / "gateway", sockets / "controller")
-            channel = stack.enter_context(Channel(None, str(sockets / "gateway")))
+            self._bring_up(stack, processes, control)
+            gateway = stack.enter_context(operator_client(control))
             try:
-                return self._operate(processes, channel, scene, objects)
+                return self._operate(processes, gateway, scene, objects)
             except KeyboardInterrupt:
                 if setup.stage is Stage.VEHIL:
                     self._stop_real_car(processes)
@@ -117,14 +116,14 @@ class RealtimeRun:
                 return
             time.sleep(POLL_S)
 
-    def _bring_up(self, stack: contextlib.ExitStack, processes: Processes, gateway_socket: Path, controller_socket: Path) -> None:
+    def _bring_up(self, stack: contextlib.ExitStack, processes: Processes, control: ControlPath) -> None:
         setup, bus = self._setup, self._setup.bus
         if bus is None:
             raise ValueError("a real-time stage needs a bus")
         telemetry = ["--telemetry-port", str(setup.telemetry_base_port)]
         vehicle = ["--vehicle", str(setup.vehicle_path)]
         contract = [*vehicle, *(argument for path in setup.dbc_paths for argument in ("--dbc", str(path))), *telemetry]
-        sockets = ["--gateway-socket", str(gateway_socket), "--controller-socket", str(controller_socket)]
+        sockets = ["--control", str(control.directory)]
         if channels := bus.hub_channels:
             bitrates = [argument for network in channels for argument in ("--bitrate", str(setup.catalogue.bitrate_bps[network]))]
             processes.start("bus", ["bus", *channels.values(), *bitrates])
@@ -139,7 +138,7 @@ class RealtimeRun:
         processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets])
         # The car starts last: in a rolling start every second counts that the others take to come up.
         self._await(processes, "gateway", lambda: self._recording.latest("status") is not None)
-        self._await(processes, "controller", controller_socket.exists)
+        self._await(processes, "controller", control.controller_socket.exists)
         if setup.stage is Stage.HIL:
             pose = setup.scenario.start_pose
             start = ["--x-m", str(pose.x_m), "--y-m", str(pose.y_m), "--yaw-rad", str(pose.yaw_rad), "--speed-mps", str(pose.speed_mps)]
@@ -157,7 +156,7 @@ class RealtimeRun:
                 raise SetupFailure(f"{name} did not come up within {START_TIMEOUT_S:.0f} s")
             time.sleep(POLL_S)
 
-    def _operate(self, processes: Processes, channel: Channel, scene: Publisher, objects: Publisher | None) -> str:
+    def _operate(self, processes: Processes, gateway: OperatorClient, scene: Publisher, objects: Publisher | None) -> str:
         """Play the operator until the run is over; why it was cut short, or nothing."""
         world = World(self._setup.scenario, self._setup.vehicle, time.monotonic_ns())
         operator = Operator(self._setup.scenario.time_limit_s, self._setup.scenario.course(self._setup.vehicle).is_at_end)
@@ -174,16 +173,15 @@ class RealtimeRun:
                 last_news_s = time.monotonic() if states else last_news_s
                 if time.monotonic() - last_news_s > SILENCE_S or self._deaths.keys() & INDISPENSABLE:
                     return self._interruption(SILENT)
-                ending = self._follow_advice(operator, states, channel)
+                ending = self._follow_advice(operator, states, gateway)
             time.sleep(LINGER_S)
         finally:
             self._progress(None)
         if ending is Ending.NEVER_READY:
-            blockers = self._recording.texts("status", "blockers")
-            raise SetupFailure("the gateway never became ready: " + ", ".join(blockers[-1] if blockers else ["no status"]))
+            raise SetupFailure("the gateway refuses: " + (", ".join(self._refusals) or "no answer"))
         return self._interruption("" if ending in (Ending.COMPLETED, Ending.STOPPED) else ending.value)
 
-    def _follow_advice(self, operator: Operator, states: list[StateSample], channel: Channel) -> Ending | None:
+    def _follow_advice(self, operator: Operator, states: list[StateSample], gateway: OperatorClient) -> Ending | None:
         """Let the operator see every new state, pass the last request on, and say whether the run is over."""
         advice = Advice()
         for state in states:
@@ -192,8 +190,9 @@ class RealtimeRun:
             if advice.ending is not None:
                 break
         if advice.operation is not None:
-            self._requests += 1
-            channel.send(OperatorRequest(self._boot_id, self._requests, advice.operation))
+            gateway.send(advice.operation)
+        while (reply := gateway.reply()) is not None:
+            self._refusals = reply.refusals
         return advice.ending
 
     def _post_scene(self, publisher: Publisher) -> None:

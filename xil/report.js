@@ -7,7 +7,7 @@
     ink: css("--ink"), quiet: css("--quiet"), line: css("--line"), driven: css("--driven"), wanted: css("--wanted"),
     fail: css("--fail"), pass: css("--pass"), cone: css("--cone"), judged: css("--judged"), tint: css("--tint"),
   };
-  const MODE_COLOURS = { STANDBY: colour.line, READY: colour.wanted, ENGAGED: colour.pass, SAFE_STOP: colour.cone, FAULT: colour.fail };
+  const MODE_COLOURS = { SILENT: colour.line, STANDBY: colour.line, READY: colour.wanted, ENGAGED: colour.pass, COMFORT_STOP: colour.cone, SAFE_STOP: colour.cone, FAULT: colour.fail };
   const AXIS_PX = 52, HEIGHT_PX = 190, FONT = "12px system-ui, sans-serif";
   const plots = [];
 

@@ -1,8 +1,9 @@
 """Telemetry: what every process tells the world, as JSON over Zenoh.
 
 Each process that publishes listens on its own loopback port; readers connect to all of them. Nothing is discovered, nothing
-leaves the machine, and a slow reader loses samples rather than holding a publisher up. Readers judge the age of a sample
-themselves: `t_ns` is CLOCK_MONOTONIC of the sending host, and samples that waited in a socket arrive late, not marked.
+leaves the machine unless the rig file says so (`security`), and a slow reader loses samples rather than holding a publisher up.
+Readers judge the age of a sample themselves: `t_ns` is CLOCK_MONOTONIC of the sending host, and samples that waited in a socket
+arrive late, not marked.
 
 The control thread calls `Publisher.post`, which only stores a reference; encoding and sending happen on a thread of its own.
 
@@ -15,13 +16,14 @@ import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from typing import Self
+from collections.abc import Callable, Mapping
+from typing import Any, Self
 
 import msgspec
 import zenoh
 
 from dbc.errors import SetupFailure
+from gateway.keys import check_secret
 from gateway.telemetry.samples import (
     TOPICS,
     CommandSample,
@@ -43,6 +45,7 @@ from gateway.telemetry.samples import (
     port_of,
     topic_of,
 )
+from gateway.telemetry.security import KEY_PREFIX, TlsSection, connecting_options, listening_options
 
 __all__ = [
     "DEFAULT_BASE_PORT",
@@ -65,6 +68,7 @@ __all__ = [
     "StatusSample",
     "Subscriber",
     "TelemetryError",
+    "TlsSection",
     "WorldObject",
     "WorldSample",
     "ask",
@@ -75,7 +79,6 @@ __all__ = [
 ]
 
 DEFAULT_BASE_PORT = 7447
-KEY_PREFIX = "xilgate"
 _QUEUE_LENGTH = 256
 _MAX_MESSAGE_BYTES = 1 << 24
 """A longer message is dropped while it arrives [bytes]: what a stranger sends does not fill our memory."""
@@ -88,8 +91,15 @@ class TelemetryError(SetupFailure):
     """Telemetry cannot be opened; one line that says why."""
 
 
-def _session(listen: list[str], connect: list[str], within_s: float | None = None) -> zenoh.Session:
-    """A session on these endpoints alone; with `within_s` it is an error when nobody answers in that time [s]."""
+def _session(
+    listen: list[str], connect: list[str], more: Mapping[str, Any] | None = None, within_s: float | None = None
+) -> zenoh.Session:
+    """A session on these endpoints alone.
+
+    Args:
+        more: settings of Zenoh.
+        within_s: time in which somebody has to answer, else it is an error [s]; None waits for ever, on threads of Zenoh's.
+    """
     config = zenoh.Config()
     for key, value in {
         "mode": "peer",
@@ -99,6 +109,7 @@ def _session(listen: list[str], connect: list[str], within_s: float | None = Non
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
+        **(more or {}),
     }.items():
         config.insert_json5(key, json.dumps(value))
     if within_s is not None:
@@ -107,22 +118,38 @@ def _session(listen: list[str], connect: list[str], within_s: float | None = Non
     return zenoh.open(config)
 
 
+def _listening(source: Source, port: int, tls: TlsSection | None) -> zenoh.Session:
+    local = f"tcp/127.0.0.1:{port}"
+    try:
+        if tls is None:
+            return _session([local], [])
+        _session([local], []).close()  # type: ignore[no-untyped-call] # so that what fails below is TLS
+    except zenoh.ZError as error:
+        raise TelemetryError(
+            f"telemetry port {port} of the {source} is busy; is another run active? Choose another with --telemetry-port"
+        ) from error
+    check_secret(tls.private_key)
+    try:
+        return _session([local, tls.endpoint(source)], [], listening_options(tls))
+    except zenoh.ZError as error:
+        files = f"{tls.certificate}, {tls.private_key} or {tls.authority}"
+        raise TelemetryError(f"telemetry of the {source} on {tls.endpoint(source)}: the port is busy, or {files} not usable") from error
+
+
 class Publisher:
     """Publishes samples of one source from a thread of its own.
 
+    Args:
+        tls: for readers on other machines; None for loopback alone.
+
     Raises:
-        TelemetryError: the port of the source is busy.
+        TelemetryError: the port of the source is busy, or TLS cannot be used.
+        KeyMistake: others can read the private key.
     """
 
-    def __init__(self, source: Source, base_port: int = DEFAULT_BASE_PORT) -> None:
-        port = port_of(source, base_port)
+    def __init__(self, source: Source, base_port: int = DEFAULT_BASE_PORT, tls: TlsSection | None = None) -> None:
         self._source = source
-        try:
-            self._session = _session([f"tcp/127.0.0.1:{port}"], [])
-        except zenoh.ZError as error:
-            raise TelemetryError(
-                f"telemetry port {port} of the {source} is busy; is another run active? Choose another with --telemetry-port"
-            ) from error
+        self._session = _listening(source, port_of(source, base_port), tls)
         self._publishers = {
             topic: self._session.declare_publisher(f"{KEY_PREFIX}/{topic}", congestion_control=zenoh.CongestionControl.DROP)
             for topic, (owner, _) in TOPICS.items()
@@ -185,11 +212,23 @@ class Subscriber:
     """Calls `on_sample(topic, payload)` for every sample of `topics`, on a thread of Zenoh.
 
     The payload is the JSON text as it came; `decode` turns it into a sample.
+
+    Args:
+        tls: for a rig that is another machine.
     """
 
-    def __init__(self, on_sample: Callable[[str, bytes], None], topics: list[str], base_port: int = DEFAULT_BASE_PORT) -> None:
-        sources = {TOPICS[topic][0] for topic in topics}
-        self._session = _session([], [f"tcp/127.0.0.1:{port_of(source, base_port)}" for source in sorted(sources)])
+    def __init__(
+        self,
+        on_sample: Callable[[str, bytes], None],
+        topics: list[str],
+        base_port: int = DEFAULT_BASE_PORT,
+        tls: TlsSection | None = None,
+    ) -> None:
+        sources = sorted({TOPICS[topic][0] for topic in topics})
+        if tls is None:
+            self._session = _session([], [f"tcp/127.0.0.1:{port_of(source, base_port)}" for source in sources])
+        else:
+            self._session = _session([], [tls.endpoint(source) for source in sources], connecting_options(tls))
 
         def receive(topic: str) -> "zenoh.handlers.Callback[zenoh.Sample]":
             # indirect=False: no Python thread of Zenoh's that would keep the interpreter from exiting.
@@ -212,8 +251,18 @@ def _service_key(source: Source, service: str) -> str:
     return f"{KEY_PREFIX}/{source}/{service}"
 
 
-def ask(source: Source, service: str, request: bytes, base_port: int = DEFAULT_BASE_PORT, timeout_s: float = 2.0) -> bytes:
+def ask(
+    source: Source,
+    service: str,
+    request: bytes,
+    base_port: int = DEFAULT_BASE_PORT,
+    timeout_s: float = 2.0,
+    tls: TlsSection | None = None,
+) -> bytes:
     """Send a request to a service of a running process, once, and wait for the answer.
+
+    Args:
+        tls: for a rig that is another machine.
 
     Raises:
         TelemetryError: the process does not run, does not answer in time, or does not take the request.
@@ -221,8 +270,13 @@ def ask(source: Source, service: str, request: bytes, base_port: int = DEFAULT_B
     port = port_of(source, base_port)
     deadline_s = time.monotonic() + timeout_s
     try:
-        session = _session([], [f"tcp/127.0.0.1:{port}"], timeout_s)
+        if tls is None:
+            session = _session([], [f"tcp/127.0.0.1:{port}"], within_s=timeout_s)
+        else:
+            session = _session([], [tls.endpoint(source)], connecting_options(tls), timeout_s)
     except zenoh.ZError as error:
+        if tls is not None:
+            raise TelemetryError(f"no {source} on {tls.endpoint(source)}, or it does not accept {tls.certificate}") from error
         raise TelemetryError(f"no {source} on port {port}, of --telemetry-port {base_port}; name the ports of your run") from error
     with session:
         while time.monotonic() < deadline_s:

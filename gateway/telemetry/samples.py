@@ -151,6 +151,12 @@ class StatusSample(Sample, frozen=True, kw_only=True):
         reason: why the mode is what it is, for people.
         blockers: what keeps the gateway from the next mode; empty when it may engage.
         dead_buses: networks whose bus refuses to deliver or to accept frames.
+        buses: state of our CAN controller on the bus of every network.
+        frames_unsent: frames that were to be sent and were not, by cause.
+        ticks_unrecorded: ticks that are missing in the record.
+        record_problem: why nothing is recorded; empty while all is well or nothing is to be.
+        realtime: what the control thread asked of the machine, and what it was refused, for people.
+        hashes: SHA-256 of files, limits and configuration, by name.
     """
 
     mode: str
@@ -164,6 +170,12 @@ class StatusSample(Sample, frozen=True, kw_only=True):
     ticks_late: int
     step_cpu_ms: float
     dead_buses: list[str] = []
+    buses: dict[str, str] = {}
+    frames_unsent: dict[str, int] = {}
+    ticks_unrecorded: int = 0
+    record_problem: str = ""
+    realtime: dict[str, str] = {}
+    hashes: dict[str, str] = {}
 
 
 class WorldObject(msgspec.Struct, frozen=True, kw_only=True):

@@ -13,7 +13,7 @@ from controller.planning.options import PlannerOptions
 from controller.planning.reference import ReferencePathError
 from controller.problem import OcpOptions
 from dbc.vehicle import FOCUS
-from gateway.channel import Channel
+from gateway.channel import Channel, control_path
 from gateway.messages import CommandStatus, ControlCommand, Mode, VehicleState
 from gateway.telemetry import CommandSample, ObjectsSample, ParametersSample, Publisher, Source, Subscriber, WorldObject, decode
 from tests.support.processes import free_base_port, wait_until
@@ -22,8 +22,12 @@ from tests.support.processes import free_base_port, wait_until
 @pytest.fixture
 def options(tmp_path, wavy_path, library):
     wavy_path.to_csv(tmp_path / "path.csv")
-    sockets = str(tmp_path / "gateway"), str(tmp_path / "controller")
-    return ControllerOptions(tmp_path / "path.csv", FOCUS, *sockets, "casadi-c", free_base_port())
+    return ControllerOptions(tmp_path / "path.csv", FOCUS, control_path(tmp_path), "casadi-c", free_base_port())
+
+
+def gateway_end(options):
+    control = options.control
+    return Channel(control.gateway_socket, control.controller_socket, control.key())
 
 
 def state_at(path, seq):
@@ -37,7 +41,7 @@ def test_states_are_answered_until_told_to_stop(options, wavy_path):
     stop = threading.Event()
     thread = threading.Thread(target=run, args=(options, stop), daemon=True)
     commands: list[ControlCommand] = []
-    with Channel(options.gateway_socket, options.controller_socket) as gateway:
+    with gateway_end(options) as gateway:
         thread.start()
         deadline_s = time.monotonic() + 60.0
         while len(commands) < 5 and time.monotonic() < deadline_s:
@@ -69,7 +73,7 @@ def test_objects_reach_the_planner_and_vanish_with_whoever_told_of_them(options,
     stop, commands = threading.Event(), []
     thread = threading.Thread(target=run, args=(options, stop), daemon=True)
     with (
-        Channel(options.gateway_socket, options.controller_socket) as gateway,
+        gateway_end(options) as gateway,
         Subscriber(lambda topic, payload: commands.append(decode(topic, payload)), ["command"], options.telemetry_base_port),
     ):
         thread.start()

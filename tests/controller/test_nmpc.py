@@ -22,6 +22,7 @@ from controller.solvers import make_solver
 from gateway.messages import CommandStatus, ControlCommand, Mode, VehicleState, pack, unpack
 from gateway.telemetry import decode, topic_of
 
+KEY = bytes(range(32))
 PERIOD_NS = 40_000_000
 SCENARIOS = {scenario.name: scenario for scenario in nominal_scenarios()}
 
@@ -122,7 +123,7 @@ def test_two_runs_are_the_same_to_the_last_bit(solver, vehicle):
         solver.reset()
         scenario: Scenario = replace(SCENARIOS["dlc80"], duration_s=1.0)
         outputs, _ = drive(Nmpc(solver, scenario.path, vehicle, 1), vehicle, scenario, seed=1)
-        return [pack(replace(output.command, solve_time_ns=0)) for output in outputs]
+        return [pack(replace(output.command, solve_time_ns=0), KEY) for output in outputs]
 
     assert run() == run()
 
@@ -135,7 +136,7 @@ def test_a_command_answers_its_state(loop, wavy_path):
     assert (command.steer_rad, command.drive_norm) == (command.plan_steer_rad[0], command.plan_drive_norm[0])
     assert command.plan_steer_rad == pytest.approx(tuple(0.01 * np.arange(30)))
     assert loop.step(state_on(wavy_path, seq=43), 2_000).command.seq == 2
-    assert unpack(pack(command)) == command
+    assert unpack(pack(command, KEY), KEY) == command
 
 
 CAR_AHEAD = Obstacle("car", 500.0, 0.0, 0.0, 4.0, 1.8)
@@ -167,7 +168,7 @@ def test_every_failure_degrades_then_fails_then_recovers(loop, stub, wavy_path, 
         output = loop.step(replace(good, **{"t_ns": now_ns, **of_state}), now_ns, objects)
         statuses.append(output.command.status)
         assert output.command.plan_steer_rad[0] == pytest.approx(0.01 * cycle)  # the old plan, where it would be now
-        assert unpack(pack(output.command)) == output.command
+        assert unpack(pack(output.command, KEY), KEY) == output.command
         assert decode("command", msgspec.json.encode(command_sample(output, "stub", 0))) is not None
     assert statuses == [CommandStatus.OK] + [CommandStatus.DEGRADED] * 3 + [CommandStatus.FAILED] * 2
     stub.status, stub.solve_time_ns = SolveStatus.CONVERGED, 0

@@ -27,7 +27,7 @@ from controller.tuning import (
     Values,
     request,
 )
-from gateway.channel import Channel
+from gateway.channel import Channel, control_path
 from gateway.messages import ControlCommand, Mode, VehicleState
 from gateway.telemetry import (
     MAX_REQUEST_BYTES,
@@ -162,15 +162,16 @@ def test_a_process_that_does_not_serve_is_told_from_none():
 class Feed(threading.Thread):
     """Plays the gateway: sends the state of a car at one place, 100 times a second, and counts the answers."""
 
-    def __init__(self, gateway_socket, controller_socket, path):
+    def __init__(self, control, path):
         super().__init__(daemon=True)
-        self._sockets, self._path = (gateway_socket, controller_socket), path
+        self._control, self._path = control, path
         self.stop = threading.Event()
         self.commands = 0
 
     def run(self):
         path, seq = self._path, 0
-        with Channel(*self._sockets) as channel:
+        control = self._control
+        with Channel(control.gateway_socket, control.controller_socket, control.key()) as channel:
             while not self.stop.wait(0.01):
                 seq += 1
                 channel.send(
@@ -184,12 +185,12 @@ class Feed(threading.Thread):
 def controller(tmp_path, wavy_path, library):
     """A controller process that drives; its telemetry port, and the samples that it publishes."""
     wavy_path.to_csv(tmp_path / "path.csv")
-    base_port, sockets = free_base_port(), (str(tmp_path / "gateway"), str(tmp_path / "controller"))
+    base_port, control = free_base_port(), control_path(tmp_path)
     samples = {"parameters": [], "command": []}
-    feed = Feed(*sockets, wavy_path)
+    feed = Feed(control, wavy_path)
     feed.start()
     process = start_xilgate(
-        "controller", "--reference", str(tmp_path / "path.csv"), "--gateway-socket", sockets[0], "--controller-socket", sockets[1],
+        "controller", "--reference", str(tmp_path / "path.csv"), "--control", str(tmp_path),
         "--telemetry-port", str(base_port), "--solver", "casadi-c",
     )  # fmt: skip
     with Subscriber(lambda topic, payload: samples[topic].append(decode(topic, payload)), list(samples), base_port):

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbc.frame import CanFrame
+from gateway.causes import Cause
 from gateway.core import TICK_NS
 from gateway.messages import CommandStatus, Mode, Operation
-from gateway.modes import Event
 from tests.support.drive import GatewayDrive
 
 
@@ -17,9 +17,10 @@ def test_state_is_si_and_iso_8855():
     drive = GatewayDrive().tick(5)
     state = drive.output.state
     assert state.is_valid
-    assert (state.x_m, state.y_m, state.vx_mps) == (12.5, -3.25, 20.0)
+    assert (state.x_m, state.y_m) == (pytest.approx(drive.car.x_m, abs=1e-4), pytest.approx(drive.car.y_m, abs=1e-4))
+    assert state.vx_mps == 20.0
     assert state.vy_mps == -0.5  # the instrument counts to the right
-    assert state.yaw_rad == pytest.approx(math.radians(10.0))
+    assert state.yaw_rad == pytest.approx(math.radians(10.25), abs=1e-4)
     assert state.yaw_rate_radps == pytest.approx(math.radians(5.0))
     assert state.t_ns == drive.now_ns
 
@@ -35,10 +36,18 @@ def test_the_state_is_as_old_as_the_time_of_its_navigation_data():
     assert output.state.t_ns == arrived_ns
 
 
-def test_silent_until_engaged():
+def test_nothing_is_sent_until_the_operator_arms():
+    drive = GatewayDrive()
+    for _ in range(300):
+        assert drive.tick().output.frames == []
+    assert (drive.core.mode, drive.core.blockers) == (Mode.SILENT, [])
+
+
+def test_neutral_until_engaged():
     drive = GatewayDrive()
     drive.steer_rad, drive.drive_norm = 0.1, 0.5
-    for _ in range(200):
+    drive.arm()
+    for _ in range(100):
         drive.tick()
         for robot in ("SR", "AR", "BR"):
             told = drive.car.told[f"{robot}_Command"]
@@ -53,6 +62,7 @@ def test_engagement_needs_the_operator_and_acts_once_per_request():
     drive.ask(Operation.DISENGAGE)
     drive.tick()
     assert drive.core.mode is Mode.STANDBY
+    drive.arm()
     drive.tick(200)
     assert drive.core.mode is Mode.READY  # and not ENGAGED: nothing re-engages by itself
 
@@ -74,28 +84,31 @@ def test_engagement_needs_the_operator_and_acts_once_per_request():
 def test_not_ready_names_every_reason(break_it, named):
     drive = GatewayDrive()
     break_it(drive)
-    drive.tick(150)
-    assert drive.core.mode is Mode.STANDBY
+    drive.tick(250)
     assert any(named in blocker for blocker in drive.core.blockers), drive.core.blockers
+    drive.ask(Operation.ARM)
+    drive.tick()
+    assert any(named in refusal for refusal in drive.output.reply.refusals)
     drive.ask(Operation.ENGAGE)
     drive.tick(5)
-    assert drive.core.mode is Mode.STANDBY
+    assert drive.core.mode is Mode.SILENT
 
 
 def test_hand_over_has_no_bump():
     drive = GatewayDrive()
-    drive.car.steering_wheel_deg = 30.0
+    drive.car.steering_wheel_deg = 25.0
     drive.car.accelerator_percent = 25.0
     drive.engage()
     told = drive.car.told
-    assert told["SR_Command"]["AngleCommand"] == pytest.approx(30.0, abs=8.1)  # one tick at 800 deg/s
+    assert told["SR_Command"]["AngleCommand"] == pytest.approx(25.0, abs=8.1)  # one tick at 800 deg/s
     assert told["AR_Command"]["PositionCommand"] == pytest.approx(25.0, abs=20.1)  # one tick of braking rate
 
 
 def test_command_reaches_the_robots_in_their_units():
     drive = GatewayDrive()
+    drive.engage()
     drive.steer_rad, drive.drive_norm = 0.05, 0.4
-    drive.engage().tick(50)
+    drive.tick(50)
     assert drive.car.told["SR_Command"]["AngleCommand"] == pytest.approx(math.degrees(0.05 * 14.7), abs=0.03)
     assert drive.car.told["AR_Command"]["PositionCommand"] == pytest.approx(40.0, abs=0.01)
     assert drive.car.told["BR_Command"]["PositionCommand"] == 0.0
@@ -129,7 +142,7 @@ def test_one_missed_command_is_tolerated_two_are_not():
     drive.is_controller_alive = False
     drive.tick(20)
     assert drive.core.mode is Mode.SAFE_STOP
-    assert drive.transitions[-1].event is Event.COMMAND_LOST
+    assert drive.transitions[-1].finding.cause is Cause.COMMAND_LOST
 
 
 def test_silent_controller_stops_the_car_within_120_ms():
@@ -167,30 +180,30 @@ def test_safe_stop_follows_the_tail_of_the_plan():
 
 
 @pytest.mark.parametrize(
-    ("break_it", "event", "mode"),
+    ("break_it", "cause", "mode"),
     [
-        (lambda d: d.car.silent.add("VelocityLevel"), Event.STATE_LOST, Mode.SAFE_STOP),
-        (lambda d: d.car.corrupt.add("BR_Status"), Event.STATE_LOST, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "is_time_frozen", True), Event.STATE_LOST, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "position_mode", "Blanked"), Event.STATE_LOST, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "fault", 1), Event.ROBOT_FAULT, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "command_timeout", 1), Event.ROBOT_FAULT, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "system_state", "Armed"), Event.ROBOT_FAULT, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "system_state", "EStop"), Event.EMERGENCY_STOP, Mode.FAULT),
-        (lambda d: setattr(d, "status", CommandStatus.FAILED), Event.COMMAND_FAILED, Mode.SAFE_STOP),
-        (lambda d: setattr(d, "command_boot_id", 8), Event.COMMAND_LOST, Mode.SAFE_STOP),
-        (lambda d: setattr(d, "steer_rad", 3.0), Event.COMMAND_LOST, Mode.SAFE_STOP),
-        (lambda d: setattr(d, "now_ns", d.now_ns + 60_000_000), Event.TICK_GAP, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "override", 1), Event.DRIVER_OVERRIDE, Mode.STANDBY),
+        (lambda d: d.car.silent.add("VelocityLevel"), Cause.MESSAGE_MISSING, Mode.SAFE_STOP),
+        (lambda d: d.car.corrupt.add("BR_Status"), Cause.MESSAGE_INVALID, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "is_time_frozen", True), Cause.NAVIGATION_FROZEN, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "position_mode", "Blanked"), Cause.NAVIGATION_COARSE, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "fault", 1), Cause.ROBOT_FAULT, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "command_timeout", 1), Cause.ROBOT_MISSES_COMMANDS, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "system_state", "Armed"), Cause.ROBOTS_NOT_ENGAGED, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "system_state", "EStop"), Cause.ROBOTS_EMERGENCY_STOP, Mode.FAULT),
+        (lambda d: setattr(d, "status", CommandStatus.FAILED), Cause.COMMAND_FAILED, Mode.SAFE_STOP),
+        (lambda d: setattr(d, "command_boot_id", 8), Cause.COMMAND_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d, "steer_rad", 3.0), Cause.COMMAND_LOST, Mode.SAFE_STOP),
+        (lambda d: setattr(d, "now_ns", d.now_ns + 60_000_000), Cause.TICK_GAP, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "override", 1), Cause.DRIVER_OVERRIDE, Mode.STANDBY),
     ],
 )
-def test_every_fault_ends_the_engagement_with_its_name(break_it, event, mode):
+def test_every_fault_ends_the_engagement_with_its_name(break_it, cause, mode):
     drive = GatewayDrive().engage().tick(50)
     assert drive.core.mode is Mode.ENGAGED
     break_it(drive)
     drive.tick(20)
     assert drive.core.mode is mode
-    assert [t.event for t in drive.transitions if t.before is Mode.ENGAGED] == [event]
+    assert [t.finding.cause for t in drive.transitions if t.before is Mode.ENGAGED] == [cause]
     drive.tick(200)
     assert drive.core.mode is not Mode.ENGAGED
 
@@ -203,12 +216,17 @@ def test_reset_leaves_a_safe_stop_and_allows_a_new_engagement():
     drive.status = CommandStatus.OK
     drive.ask(Operation.RESET)
     drive.tick()
+    assert drive.output.reply.refusals == ("the car moves: 20.0 m/s",)
+    drive.car.vx_mps = 0.0
+    drive.tick(20)
+    drive.ask(Operation.RESET)
+    drive.tick()
     assert drive.core.mode is Mode.STANDBY
     drive.engage()
 
 
 def test_heartbeat_every_100_ms():
-    drive = GatewayDrive()
+    drive = GatewayDrive().arm()
     heartbeat_id = drive.catalogue.by_name["GW_Heartbeat"].arbitration_id
     beats = [any(f.arbitration_id == heartbeat_id for f in drive.tick().output.frames) for _ in range(100)]
     assert sum(beats) == 10
@@ -248,5 +266,5 @@ def test_no_frame_makes_the_core_raise(data):
     ids = st.one_of(st.sampled_from(sorted(drive.catalogue.by_id)), st.integers(0, 2047))
     frames = data.draw(st.lists(st.builds(CanFrame, ids, st.binary(max_size=8), st.just(now_ns)), max_size=40))
     output = drive.core.step(now_ns, frames)
-    assert output.state.mode is Mode.STANDBY
+    assert output.state.mode is Mode.SILENT
     assert drive.core.supervisor.received >= len(frames)

@@ -29,12 +29,12 @@ class GatewayDrive:
 
     def ask(self, operation: Operation) -> None:
         self._requests += 1
-        self._to_send = OperatorRequest(9, self._requests, operation)
+        self._to_send = OperatorRequest(9, self._requests, operation, self.now_ns)
 
     def command(self) -> ControlCommand:
         return ControlCommand(
             boot_id=self.command_boot_id, seq=self._ticks, state_seq=self.core.ticks, t_ns=self.now_ns, status=self.status, solve_time_ns=0,
-            steer_rad=self.steer_rad, drive_norm=self.drive_norm,
+            lateral_error_m=0.0, heading_error_rad=0.0, steer_rad=self.steer_rad, drive_norm=self.drive_norm,
             plan_steer_rad=self.plan_steer_rad or (self.steer_rad,) * HORIZON_STEPS,
             plan_drive_norm=(self.drive_norm,) * HORIZON_STEPS,
         )
@@ -51,9 +51,15 @@ class GatewayDrive:
                 self.transitions.append(self.output.transition)
         return self
 
-    def engage(self):
-        self.tick(130)
+    def arm(self):
+        self.tick(210)
+        self.ask(Operation.ARM)
+        self.tick(2)
         assert self.core.mode is Mode.READY, self.core.blockers
+        return self
+
+    def engage(self):
+        self.arm()
         self.ask(Operation.ENGAGE)
         self.tick(1)
         assert self.core.mode is Mode.ENGAGED

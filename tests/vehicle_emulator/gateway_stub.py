@@ -1,18 +1,24 @@
 """A gateway reduced to its frames, written from the DBC alone."""
 
+from collections.abc import Callable
+
 from dbc.catalogue import Catalogue
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 
 
 class GatewayStub:
-    """Makes protected command frames; every call of `frames` advances the alive counters."""
+    """Makes protected command frames; every call of `frames` advances the alive counters.
 
-    def __init__(self, catalogue: Catalogue) -> None:
+    Args:
+        question: what the robot controller's watchdog asks now.
+    """
+
+    def __init__(self, catalogue: Catalogue, question: Callable[[], int]) -> None:
         self.catalogue = catalogue
         self.requests = catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
         self._protectors: dict[str, E2EProtector] = {}
-        self._challenge = 0
+        self._question = question
 
     def frame(self, name: str, values: dict[str, float], t_ns: int = 0) -> CanFrame:
         spec = self.catalogue.by_name[name]
@@ -21,8 +27,9 @@ class GatewayStub:
         return CanFrame(spec.arbitration_id, protector.protect(self.catalogue.encode(name, values)), t_ns)
 
     def safety(self, request: str, **values: float) -> CanFrame:
-        self._challenge = (self._challenge + 1) % 256
-        defaults = {"SystemRequest": self.requests[request], "WatchdogChallenge": self._challenge, "MaxSpeed": 255}
+        question = self._question()
+        watchdog_answer = ((question << 3 | question >> 5) & 0xFF) ^ 0xA7
+        defaults = {"SystemRequest": self.requests[request], "WatchdogAnswer": watchdog_answer, "MaxSpeed": 255}
         return self.frame("GW_SafetyCommand", {**defaults, **values})
 
     def steering(

@@ -169,7 +169,7 @@ def test_junk_on_the_bus_moves_nothing_and_raises_nothing(ticks: list[list[CanFr
 
 def test_without_engagement_commands_move_nothing():
     car = emulator()
-    stub = GatewayStub(CATALOGUE)
+    stub = GatewayStub(CATALOGUE, lambda: car._robots.watchdog_question)
     for request in ("None", "Disarm", "ControlledStop", "ClearFaults", "Arm"):
         run(car, 100, lambda k, request=request: stub.frames(request, sr_deg=90.0, ar_percent=50.0, br_percent=50.0) if k % 10 == 0 else ())
     truth = car.truth()
@@ -244,7 +244,8 @@ def test_on_the_lift_the_bench_turns_and_the_virtual_car_drives():
 
 
 def test_a_car_that_is_disarmed_does_not_creep_away_and_is_handed_over_to_the_robots_again():
-    car, gateway = emulator(StartPose()), GatewayStub(CATALOGUE)
+    car = emulator(StartPose())
+    gateway = GatewayStub(CATALOGUE, lambda: car._robots.watchdog_question)
     now = 0
 
     def ask(milliseconds: int, request: str, **commands: float) -> GroundTruth:

@@ -307,7 +307,8 @@ class Ride:
 
     def __init__(self, **setup):
         catalogue = load()
-        self.emulator, self.gateway, self.step = Emulator(EmulatorSetup(VEHICLE, **setup), catalogue, 0), GatewayStub(catalogue), 0
+        self.emulator, self.step = Emulator(EmulatorSetup(VEHICLE, **setup), catalogue, 0), 0
+        self.gateway = GatewayStub(catalogue, lambda: self.emulator._robots.watchdog_question)
         self.lift = lift_operations(self.emulator.car, lambda: self.emulator.inputs, self.emulator.robot_actions)
 
     def run(self, seconds: float, request: str | None, **commands: float) -> None:

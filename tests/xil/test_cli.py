@@ -110,7 +110,7 @@ def test_late_write_error_is_one_line(tmp_path):
 
 
 def test_operating_without_a_gateway(tmp_path):
-    fails(3, "no gateway", arguments=["operate", "engage", "--gateway-socket", str(tmp_path / "nobody")])
+    fails(3, "no gateway", arguments=["operate", "engage", "--control", str(tmp_path / "nobody")])
 
 
 def test_busy_page_port():

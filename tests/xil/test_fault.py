@@ -211,7 +211,8 @@ class Loop:
         self.emulator = Emulator(setup, CATALOGUE, START_NS)
         self.now_ns = START_NS
         self.transitions, self.events, self.traffic = [], [], []
-        self._to_car, self._to_gateway, self._request = [], [], OperatorRequest(9, 1, Operation.ENGAGE)
+        self._to_car, self._to_gateway = [], []
+        self._is_to_engage = True
 
     def run(self, seconds):
         for _ in range(round(seconds * 1e9 / STEP_NS)):
@@ -225,8 +226,10 @@ class Loop:
         return self
 
     def _tick(self):
-        request = self._request if self.gateway.mode is Mode.READY else None
+        operation = {Mode.SILENT: Operation.ARM, Mode.READY: Operation.ENGAGE}.get(self.gateway.mode) if self._is_to_engage else None
+        request = None if operation is None else OperatorRequest(9, self.now_ns, operation, self.now_ns)
         output = self.gateway.step(self.now_ns, self._to_gateway, self._command(), request)
+        self._is_to_engage = self._is_to_engage and self.gateway.mode is not Mode.ENGAGED
         self._to_car, self._to_gateway = output.frames, []
         if output.transition is not None:
             self.transitions.append(((self.now_ns - START_NS) / 1e9, output.transition.after, output.transition.reason))
@@ -237,7 +240,8 @@ class Loop:
         level = (0.05,) * HORIZON_STEPS
         return ControlCommand(
             boot_id=7, seq=self.now_ns // TICK_NS, state_seq=self.gateway.ticks, t_ns=self.now_ns, status=CommandStatus.OK, solve_time_ns=0,
-            steer_rad=0.0, drive_norm=0.05, plan_steer_rad=(0.0,) * HORIZON_STEPS, plan_drive_norm=level,
+            lateral_error_m=0.0, heading_error_rad=0.0, steer_rad=0.0, drive_norm=0.05,
+            plan_steer_rad=(0.0,) * HORIZON_STEPS, plan_drive_norm=level,
         )  # fmt: skip
 
     def stop_after(self, t_s):
@@ -281,11 +285,13 @@ def test_commands_that_do_not_arrive_stop_the_car_by_itself():
     assert loop.transitions[-1][1] is not Mode.ENGAGED
 
 
-def test_what_a_babbling_idiot_says_in_the_name_of_a_robot_is_counted_and_ignored():
+def test_what_a_babbling_idiot_says_in_the_name_of_a_robot_is_counted_and_ignored_and_soon_ends_the_drive():
     identifier = CATALOGUE.by_name["SR_Status"].arbitration_id
-    loop = Loop({"kind": "babble", "id": identifier, "rate_hz": 500, "from_s": 2.0}).run(3.0)
+    loop = Loop({"kind": "babble", "id": identifier, "rate_hz": 500, "from_s": 2.5}).run(3.5)
     assert sum(count for cause, count in loop.gateway.supervisor.rejected.items() if cause.startswith("SR_Status: ")) == 501
-    assert loop.gateway.mode is Mode.ENGAGED
+    at_s, mode, reason = loop.stop_after(2.5)
+    assert at_s == pytest.approx(2.5, abs=0.021)
+    assert (mode, reason.partition(":")[0]) == (Mode.SAFE_STOP, "message is invalid")
 
 
 def test_the_same_seed_gives_the_same_run():

@@ -4,7 +4,7 @@ from msgspec.structs import replace
 
 from gateway.messages import Operation
 from gateway.telemetry import StateSample
-from xil.operator import PATIENCE_S, READY_TIMEOUT_S, Advice, Ending, Operator
+from xil.operator import ASK_PERIOD_S, PATIENCE_S, READY_TIMEOUT_S, Advice, Ending, Operator
 
 STATE = StateSample(
     t_ns=0, seq=0, mode="STANDBY", is_valid=True, x_m=0.0, y_m=0.0, yaw_rad=0.0, vx_mps=0.0, vy_mps=0.0, yaw_rate_radps=0.0, ax_mps2=0.0,
@@ -30,16 +30,23 @@ class Run:
         return Advice()
 
 
-def test_engages_when_ready_and_not_before():
+def test_arms_then_engages_and_asks_again_until_it_is_granted():
     run = Run()
-    assert run.go(2.0, "STANDBY", 20.0) == Advice()
+    assert run.go(0.1, "SILENT", 20.0) == Advice(Operation.ARM)
+    assert run.go(ASK_PERIOD_S - 0.02, "SILENT", 20.0) == Advice()
+    assert run.go(0.1, "STANDBY", 20.0) == Advice(Operation.ARM)
+    assert run.go(0.02, "READY", 20.0) == Advice(Operation.ENGAGE)
+    assert run.go(ASK_PERIOD_S - 0.02, "READY", 20.0) == Advice()
     assert run.go(0.1, "READY", 20.0) == Advice(Operation.ENGAGE)
+    assert run.go(5.0, "ENGAGED", 20.0) == Advice()
 
 
 def test_gives_up_when_never_ready():
     run = Run()
-    assert run.go(READY_TIMEOUT_S - 1.0, "STANDBY") == Advice()
-    assert run.go(2.0, "STANDBY") == Advice(ending=Ending.NEVER_READY)
+    advice = [run.go(0.02, "STANDBY") for _ in range(round((READY_TIMEOUT_S - 1.0) * 50))]
+    assert {one.operation for one in advice} == {None, Operation.ARM}
+    assert {one.ending for one in advice} == {None}
+    assert Ending.NEVER_READY in [run.go(0.02, "STANDBY").ending for _ in range(100)]
 
 
 def test_ends_when_the_car_stands_at_the_end():

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from vehicle_emulator.bus.bits import classical_bounds
+from dbc.frame_length import classical_bounds
 from vehicle_emulator.bus.frame import EXTENDED, BusFrame, arbitration_key
 
 ERROR_SIGNALLING_BITS = 31

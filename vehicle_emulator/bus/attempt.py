@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import NamedTuple
 
-from vehicle_emulator.bus.bits import AFTER_ACKNOWLEDGE_BITS, CLASSICAL_TAIL_BITS, FD_TAIL_BITS, frame_bits
+from dbc.frame_length import CLASSICAL_TAIL_BITS
+from vehicle_emulator.bus.bits import AFTER_ACKNOWLEDGE_BITS, FD_TAIL_BITS, frame_bits
 from vehicle_emulator.bus.frame import BITRATE_SWITCH, ERROR_STATE_INDICATOR, FD, BusFrame
 from vehicle_emulator.bus.node import Node
 

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from itertools import count
 from typing import NamedTuple
 
+from dbc.frame_length import CLASSICAL_TAIL_BITS, INTERMISSION_BITS
 from vehicle_emulator.bus import error_frames
 from vehicle_emulator.bus.attempt import DELIMITER_BITS, FLAG_BITS, Attempt, BitTiming, Outcome, arbitrate
-from vehicle_emulator.bus.bits import CLASSICAL_TAIL_BITS, INTERMISSION_BITS
 from vehicle_emulator.bus.confinement import SEQUENCE_BITS, ErrorCounters
 from vehicle_emulator.bus.frame import BusFrame, arbitration_key
 from vehicle_emulator.bus.load import LoadMeter

@@ -260,7 +260,7 @@ class Hub:
             case Hello(wire.VERSION) if peer.node is None:
                 self._join(peer, now_ns)
             case Settings() if peer.node is not None:
-                peer.settings = control
+                peer.set(control)
                 self.core.report_bus_errors(peer.node, control.bus_errors)
                 restart_ms = self._default_restart_ms if control.restart_ms is None else control.restart_ms
                 self.core.set_restart(peer.node, restart_ms or None)

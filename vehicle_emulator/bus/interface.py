@@ -64,6 +64,7 @@ class XilgateBus(can.BusABC):
     ) -> None:
         self._channel = str(channel)
         self._error_state = ErrorState.ACTIVE
+        self._named_ids: frozenset[int] = frozenset()
         self._own_messages, self._bus_errors, self._restart_ms = receive_own_messages, berr_reporting, restart_ms
         self.channel_info = f"xilgate channel '{self._channel}'"
         self._connection = _connect(self._channel)
@@ -105,6 +106,7 @@ class XilgateBus(can.BusABC):
 
     def _apply_filters(self, filters: CanFilters | None) -> None:
         settings = wire.Settings(_wire_filters(filters), self._own_messages, self._bus_errors, self._restart_ms)
+        self._named_ids = wire.named_ids(settings.filters or ())
         self._transfer(wire.pack_control(settings), _JOIN_TIMEOUT_S)
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
@@ -122,8 +124,12 @@ class XilgateBus(can.BusABC):
             raise can.CanOperationError(f"{self.channel_info}: the hub has gone")
         content = wire.unpack(packet)
         # The hub says nothing but frames to a node that has joined. Filters are applied again, for frames that were on their way
-        # when they were changed; error frames pass whatever they are, as with SocketCAN.
-        return (self._message(*content), bool(content[0].flags & ERROR)) if isinstance(content, tuple) else (None, False)
+        # when they were changed, but for those that a filter names; error frames pass whatever they are, as with SocketCAN.
+        if not isinstance(content, tuple):
+            return None, False
+        frame = content[0]
+        is_named = frame.arbitration_id in self._named_ids and not frame.flags & EXTENDED
+        return self._message(*content), is_named or bool(frame.flags & ERROR)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand a frame to the bus.

@@ -6,7 +6,7 @@ from enum import Enum
 
 from vehicle_emulator.bus.connection import Connection
 from vehicle_emulator.bus.frame import ERROR, EXTENDED, BusFrame
-from vehicle_emulator.bus.wire import Control, Settings, WireError, unpack
+from vehicle_emulator.bus.wire import Control, Settings, WireError, named_ids, unpack
 
 PATIENCE_NS = 1_000_000_000
 """For a caller that does not say what it wants, and for the pending frames of a node that has closed its connection [ns]."""
@@ -47,6 +47,7 @@ class Peer:
         self.descriptor = connection.fileno()
         self.node: int | None = None
         self.settings = Settings()
+        self._named_ids: frozenset[int] = frozenset()
         self.stage = Stage.OPEN
         self._connection = connection
         self._epoll = epoll
@@ -101,12 +102,19 @@ class Peer:
                 room -= 1
         return contents, malformed
 
+    def set(self, settings: Settings) -> None:
+        """It says what it wants to hear."""
+        self.settings = settings
+        self._named_ids = named_ids(settings.filters or ())
+
     def wants(self, frame: BusFrame) -> bool:
         """Whether a frame passes its filters; error frames always do, as with SocketCAN."""
         filters = self.settings.filters
         if filters is None or frame.flags & ERROR:
             return True
         is_extended = bool(frame.flags & EXTENDED)
+        if not is_extended and frame.arbitration_id in self._named_ids:
+            return True
         return any((one.can_id ^ frame.arbitration_id) & one.can_mask == 0 and one.extended in (None, is_extended) for one in filters)
 
     def send(self, packet: bytes) -> bool:

@@ -1,6 +1,7 @@
 """Packets between the hub and a node: frames with their time in a fixed layout, and everything rare as a MessagePack object."""
 
 import struct
+from collections.abc import Iterable
 from typing import Annotated
 
 import msgspec
@@ -58,6 +59,11 @@ class Filter(msgspec.Struct, frozen=True, array_like=True):
     can_id: int
     can_mask: int
     extended: bool | None
+
+
+def named_ids(filters: Iterable[Filter]) -> frozenset[int]:
+    """Identifiers that filters name and let pass in standard frames: most frames are judged by these, without a look at every filter."""
+    return frozenset(one.can_id for one in filters if not one.extended)
 
 
 class Settings(msgspec.Struct, frozen=True, tag=True, forbid_unknown_fields=True):

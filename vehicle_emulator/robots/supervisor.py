@@ -59,7 +59,7 @@ class SafetyInputs(NamedTuple):
         is_stop_requested: emergency stop of the gateway.
         are_commands_fresh: whether the safety command and the commands of all three robots are.
         are_frames_bad: whether commands that are not fresh arrive, with wrong CRC or counter.
-        is_watchdog_answered: whether the gateway still changes its watchdog challenge.
+        is_watchdog_answered: whether the gateway has answered a question of the watchdog of late.
         have_robots_started, has_robot_fault: of the three robots.
         is_overridden: whether the driver has taken over.
         is_too_fast: whether the car is faster than the gateway allows.

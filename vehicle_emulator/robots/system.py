@@ -3,11 +3,12 @@
 A robot follows its command while the system is Engaged, the dead-man switch is pressed, its own Enable bit is set with an active
 Mode, and its command is fresh. A frame counts only with the right length, CRC, alive counter, ranges and tables, when it does not
 change the active Mode of an engaged robot, and when it does not change the session of an armed or engaged system. What does not
-count never arrived. The system stops when any of the four commands has not come for GenMsgTimeout, or when the watchdog challenge
-has not changed for as long. What the robots do in a stop is told in `steering` and `pedal`.
+count never arrived. The system stops when any of the four commands has not come for GenMsgTimeout, or when its watchdog
+question has not been answered for as long. What the robots do in a stop is told in `steering` and `pedal`.
 """
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from random import Random
 from typing import NamedTuple
@@ -15,6 +16,7 @@ from typing import NamedTuple
 from dbc.catalogue import Catalogue
 from dbc.frame import CanFrame
 from dbc.vehicle import Vehicle
+from dbc.watchdog import QUESTIONS, answer
 from vehicle_emulator.driver import Driver
 from vehicle_emulator.plants.interface import PlantInputs, PlantState
 from vehicle_emulator.robots.faults import HEALTHY, RobotFaults
@@ -34,6 +36,8 @@ STATUS_MESSAGES = (SUPERVISOR_MESSAGE, REPORT_MESSAGE, *(f"{node}_{kind}" for ki
 
 INTERLOCK_NORM = 0.01
 """Brake demand above which the accelerator is kept at zero."""
+QUESTIONS_OPEN = 4
+"""Questions that may be answered at a time: status, gateway and command take up to three of their periods."""
 _KMH_PER_MPS = 3.6
 
 
@@ -55,6 +59,7 @@ class RobotSystem:
         was_engaged: whether the robots have ever been engaged.
         faults: what is wrong with each robot, by its node; values may be replaced at any time.
         memory: troubles since the start.
+        watchdog_question: that the gateway has to answer now.
     """
 
     def __init__(self, vehicle: Vehicle, catalogue: Catalogue, period_s: float, random: Random) -> None:
@@ -69,19 +74,21 @@ class RobotSystem:
         self._requests = {raw: name for name, raw in catalogue.enumeration("GW_SafetyCommand", "SystemRequest").items()}
         self._system_states = catalogue.enumeration(SUPERVISOR_MESSAGE, "SystemState")
         self._stop_sources = catalogue.enumeration(SUPERVISOR_MESSAGE, "StopSource")
+        self._question_period_ns = catalogue.by_name[SUPERVISOR_MESSAGE].cycle_time_ns
         self._watchdog_timeout_ns = catalogue.by_name["GW_SafetyCommand"].timeout_ns
         self._report = FaultReport(robots, catalogue.enumeration(REPORT_MESSAGE, "Robot"))
         self._codes = catalogue.enumeration(REPORT_MESSAGE, "Dtc")
         self._thermometers = {node: Thermometer() for node in NODES}
         self._start_ns: int | None = None
         self._now_ns = 0
-        self._challenge = -1.0
-        self._challenged_ns = 0
+        self._open_answers = deque([answer(0)], maxlen=QUESTIONS_OPEN)
+        self._answered_ns = 0
         self._driver = Driver()
         self._conditions: tuple[object, ...] = ()
         self._next_warming_ns = 0
         self.faults: dict[str, RobotFaults] = dict.fromkeys(NODES, HEALTHY)
         self.supervisor = Supervisor()
+        self.watchdog_question = 0
         self.memory = FaultMemory()
         self.was_engaged = False
 
@@ -108,6 +115,7 @@ class RobotSystem:
         """
         self._start_ns = now_ns if self._start_ns is None else self._start_ns
         self._now_ns, self._driver = now_ns, driver
+        self._ask(now_ns)
         self._receive(now_ns, frames)
         inputs = self._safety_inputs(now_ns, math.hypot(feedback.vx_mps, feedback.vy_mps))
         self.supervisor.update(inputs)
@@ -130,13 +138,20 @@ class RobotSystem:
         is_bound = self.supervisor.state in (SystemState.ARMED, SystemState.ENGAGED)
         return int(values["SystemRequest"]) in self._requests and not (is_bound and values["SessionId"] != self._safety.values["SessionId"])
 
+    def _ask(self, now_ns: int) -> None:
+        """Ask a new question with every period of the status; a few before it stay open, as new ones may cross the answer on the bus."""
+        question = now_ns // self._question_period_ns % QUESTIONS
+        if question != self.watchdog_question:
+            self.watchdog_question = question
+            self._open_answers.append(answer(question))
+
     def _receive(self, now_ns: int, frames: Sequence[CanFrame]) -> None:
         for frame in frames:
             receiver = self._receivers.get(frame.arbitration_id)
             if receiver is None or not receiver.receive(now_ns, frame) or receiver is not self._safety:
                 continue
-            if (challenge := receiver.values["WatchdogChallenge"]) != self._challenge:
-                self._challenge, self._challenged_ns = challenge, now_ns
+            if int(receiver.values["WatchdogAnswer"]) in self._open_answers:
+                self._answered_ns = now_ns
 
     def _safety_inputs(self, now_ns: int, speed_mps: float) -> SafetyInputs:
         safety, is_safety_fresh = self._safety.values, self._safety.is_fresh(now_ns)
@@ -148,7 +163,7 @@ class RobotSystem:
             is_stop_requested=is_safety_fresh and bool(safety["EmergencyStopRequest"]),
             are_commands_fresh=not stale,
             are_frames_bad=any(receiver.trouble in (Dtc.COMMAND_CRC, Dtc.COMMAND_COUNTER) for receiver in stale),
-            is_watchdog_answered=now_ns - self._challenged_ns <= self._watchdog_timeout_ns,
+            is_watchdog_answered=now_ns - self._answered_ns <= self._watchdog_timeout_ns,
             is_dead_man_pressed=self._driver.is_dead_man_pressed,
             have_robots_started=STARTING.isdisjoint(states),
             has_robot_fault=not FAULTED.isdisjoint(states),
@@ -216,7 +231,7 @@ class RobotSystem:
         state = self.supervisor.state
         return {
             "SystemState": self._system_states[state],
-            "WatchdogResponse": 255 - int(self._safety.values["WatchdogChallenge"]),
+            "WatchdogQuestion": self.watchdog_question,
             "SessionId": self._safety.values["SessionId"],
             "StopSource": self._stop_sources[self.supervisor.stop_source],
             "EmergencyStopActive": state is SystemState.EMERGENCY_STOP,
@@ -226,6 +241,7 @@ class RobotSystem:
             "SrReady": self._sr.is_ready,
             "ArReady": self._ar.is_ready,
             "BrReady": self._br.is_ready,
+            "MeasurementId": self._safety.values["MeasurementId"],
             "BrakeFallback": state in STOPS and self._br.state is RobotState.FAULT_HARD,
             "SupplyVoltage": self._supply_v,
             "ControllerTemperature": controller_degc(self._elapsed_s),

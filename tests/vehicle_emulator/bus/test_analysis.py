@@ -7,9 +7,10 @@ from itertools import chain, combinations, count
 import pytest
 
 from dbc.catalogue import NETWORKS, load
+from dbc.frame_length import classical_bounds
 from tests.vehicle_emulator.bus import bit_stream
 from vehicle_emulator.bus.analysis import MessageTiming, bus_load, response_times
-from vehicle_emulator.bus.bits import classical_bounds, frame_bits
+from vehicle_emulator.bus.bits import frame_bits
 from vehicle_emulator.bus.core import BusCore
 from vehicle_emulator.bus.frame import BusFrame
 

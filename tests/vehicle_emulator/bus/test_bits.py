@@ -6,8 +6,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from dbc.frame_length import classical_bounds
 from tests.vehicle_emulator.bus import bit_stream
-from vehicle_emulator.bus.bits import classical_bounds, frame_bits
+from vehicle_emulator.bus.bits import frame_bits
 from vehicle_emulator.bus.frame import BITRATE_SWITCH, ERROR_STATE_INDICATOR, EXTENDED, FD, REMOTE, BusFrame, arbitration_key
 
 

@@ -56,8 +56,8 @@ class Bench:
     """See the module; `speed_mps`, `sideways_mps` and `driver` may be set between steps."""
 
     def __init__(self, vehicle: Vehicle = VEHICLE, seed: int = 1, wheel: LiftedWheel | None = None) -> None:
-        self.gateway = GatewayStub(CATALOGUE)
         self.system = RobotSystem(vehicle, CATALOGUE, 1e-3, Random(seed))
+        self.gateway = GatewayStub(CATALOGUE, lambda: self.system.watchdog_question)
         self.wheel = wheel or SteeringWheel(vehicle, 1e-3)
         self.ms = 0
         self.speed_mps = 20.0

@@ -241,19 +241,22 @@ def test_a_mode_changes_through_standby():
     assert bench.status("BR_Status")["ForceActual"] == pytest.approx(207.5, abs=11.0)
 
 
-def test_watchdog_and_session_are_answered():
+def test_session_and_measurement_are_echoed_and_a_question_asked_with_every_status():
     bench = Bench()
-    bench.step([bench.gateway.safety("None", WatchdogChallenge=0xA5, SessionId=77)])
+    bench.step([bench.gateway.safety("None", MeasurementId=9, SessionId=77)])
     status = bench.status("RC_SafetyStatus")
-    assert status["WatchdogResponse"] == 0x5A
+    assert status["MeasurementId"] == 9
     assert status["SessionId"] == 77
+    first = status["WatchdogQuestion"]
+    bench.silence(10)
+    assert bench.status("RC_SafetyStatus")["WatchdogQuestion"] == (first + 1) % 256
 
 
-def test_a_gateway_that_repeats_its_challenge_has_hung():
+def test_a_gateway_that_repeats_its_answer_has_hung():
     bench = Bench().engage()
     gateway = bench.gateway
     began_ms = bench.ms
     while bench.state == "Engaged" and bench.ms < began_ms + 500:
-        bench.send(1, lambda: [gateway.safety("Engage", WatchdogChallenge=7), *gateway.frames("Engage")[1:]])
+        bench.send(1, lambda: [gateway.safety("Engage", WatchdogAnswer=0xE1), *gateway.frames("Engage")[1:]])
     assert (bench.state, bench.stop_source) == ("ControlledStop", "WatchdogAnswer")
     assert bench.ms - began_ms == pytest.approx(TIMEOUT_MS, abs=11)

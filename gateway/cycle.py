@@ -1,0 +1,137 @@
+"""What the control thread does 100 times a second. It waits for nobody, and what is slow it leaves to others (`housekeeping`)."""
+
+import logging
+import time
+from dataclasses import dataclass
+
+from dbc.link import BusSet
+from gateway.channel import Channel, OperatorServer
+from gateway.conditions import Surroundings
+from gateway.core import StepOutput
+from gateway.ending import Ending
+from gateway.housekeeping import QUIET, Notice, Orders, Pulse
+from gateway.journal import StepArguments
+from gateway.messages import ControlCommand, Operation, OperatorReply, OperatorRequest
+from gateway.preparation import Preparation
+from gateway.recorder import Recorder, RecorderStatus
+from gateway.samples import VIRTUAL, GatewaySampler, Process
+from gateway.telemetry import Publisher, StatusSample
+
+NO_RECORD = RecorderStatus(is_recording=False, disk_free_share=1.0, recorded=0, lost=0, problem="")
+
+
+@dataclass(frozen=True, slots=True)
+class Links:
+    """All that a gateway is connected to.
+
+    Args:
+        recorder: None where nothing is recorded.
+    """
+
+    buses: BusSet
+    channel: Channel
+    operators: OperatorServer
+    telemetry: Publisher
+    recorder: Recorder | None
+
+
+class ControlCycle:
+    """One gateway with its connections.
+
+    Attributes:
+        is_over: whether the loop is to end.
+        successor: the configuration to go on with after that, None when there is none.
+    """
+
+    def __init__(self, preparation: Preparation, boot_id: int, links: Links, pulse: Pulse, orders: Orders) -> None:
+        self._links = links
+        self._pulse = pulse
+        self._orders = orders
+        self._stop_within_ns = round(preparation.rig.daemon.stop_within_s * 1e9)
+        self._boot_id = boot_id
+        self._core = preparation.new_core(boot_id)
+        self._sampler = GatewaySampler()
+        self._hashes = dict(preparation.hashes)
+        self._realtime = {name: str(grant) for name, grant in pulse.realtime.items()}
+        self._record = NO_RECORD
+        self._ending: Ending | None = None
+        self.is_over = False
+        self.successor: Preparation | None = None
+
+    def step(self, now_ns: int, overruns: int) -> None:
+        """One tick: hear, decide, speak; then tell whoever wants to know."""
+        cpu_start_ns = time.thread_time_ns()
+        links = self._links
+        frames, command, request = links.buses.receive(), links.channel.newest(ControlCommand), self._request(now_ns)
+        arguments = StepArguments(now_ns, frames, command, request, self._surroundings(now_ns))
+        output = self._core.step(*arguments)
+        links.buses.send(output.frames)
+        links.channel.send(output.state)
+        if links.recorder is not None:
+            links.recorder.record(arguments, output)
+        if output.reply is not None:
+            self._answer(output.reply)
+        cpu_ns = time.thread_time_ns() - cpu_start_ns
+        self._pulse.step_cpu.observe(cpu_ns)
+        self._tell(now_ns, output, overruns, cpu_ns)
+        self._heed_orders(now_ns, output)
+        self._pulse.ticks += 1
+
+    def _surroundings(self, now_ns: int) -> Surroundings:
+        health = self._links.buses.health()
+        if self._links.recorder is None:
+            return Surroundings(health)
+        self._record = self._links.recorder.poll(now_ns)
+        return Surroundings(health, self._record.is_recording, self._record.disk_free_share)
+
+    def _answer(self, reply: OperatorReply) -> None:
+        if reply.operation is Operation.RESET and not reply.refusals:
+            self._links.buses.recover()
+        if reply.boot_id != self._boot_id:
+            self._links.operators.reply(reply)
+
+    def _request(self, now_ns: int) -> OperatorRequest | None:
+        """What an operator wants, or what has to be done before the process may end."""
+        request = self._links.operators.next_request()
+        if request is None and self._ending is not None and (operation := self._ending.request(self._core.mode)) is not None:
+            return OperatorRequest(self._boot_id, self._core.ticks, operation, now_ns)
+        return request
+
+    def _tell(self, now_ns: int, output: StepOutput, overruns: int, cpu_ns: int) -> None:
+        if output.transition is not None:
+            self._pulse.post(output.transition)
+        process = self._process(overruns, cpu_ns) if self._sampler.is_status_due(self._core, output) else VIRTUAL
+        for sample in self._sampler.sample(self._core, output, now_ns, process):
+            self._links.telemetry.post(sample)
+            if isinstance(sample, StatusSample):
+                self._pulse.status = sample
+
+    def _process(self, overruns: int, cpu_ns: int) -> Process:
+        buses = self._links.buses
+        return Process(
+            ticks_late=overruns,
+            step_cpu_ms=cpu_ns * 1e-6,
+            dead_buses=buses.dead,
+            frames_dropped=buses.dropped,
+            frames_unsent=buses.unsent,
+            links=buses.health(),
+            ticks_unrecorded=self._record.lost,
+            record_problem=self._record.problem,
+            realtime=self._realtime,
+            hashes=self._hashes,
+        )
+
+    def _heed_orders(self, now_ns: int, output: StepOutput) -> None:
+        mode = self._core.mode
+        if self._orders.ends > 0 and self._ending is None:
+            self._ending = Ending(now_ns, self._stop_within_ns)
+            self._pulse.post(Notice(logging.INFO, f"asked to end in mode {mode.name}", {"mode": mode.name}))
+        if self._ending is not None:
+            is_standing_known = output.state.is_valid
+            self.is_over = self._orders.ends > 1 or self._ending.is_over(now_ns, mode, output.state.vx_mps, is_standing_known)
+        elif (successor := self._pulse.successor) is not None:
+            self._pulse.successor = None
+            if mode in QUIET:
+                self.is_over, self.successor = True, successor
+            else:
+                self._pulse.post(Notice(logging.WARNING, f"reload refused: mode {mode.name}", {"mode": mode.name}))

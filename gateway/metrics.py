@@ -1,0 +1,144 @@
+"""Prometheus metrics of the gateway: a snapshot of its last status and its counters, served on the loopback interface."""
+
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from itertools import accumulate
+from typing import Any, Self
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+
+from prometheus_client import CollectorRegistry, make_wsgi_app
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from dbc.errors import SetupFailure
+from dbc.health import BusState
+from gateway.housekeeping import Pulse
+from gateway.logs import LogThread
+from gateway.loop import BUCKETS_NS, Histogram
+from gateway.messages import Mode
+from gateway.telemetry import StatusSample
+
+_PREFIX = "xilgate_gateway_"
+_REQUEST_TIMEOUT_S = 2.0
+_PAUSE_S = 0.05
+"""Pause after every request [s]: whoever asks in a loop gets no more than a few per cent of a processor."""
+_S_PER_NS = 1e-9
+
+
+class MetricsError(SetupFailure):
+    """The port of the metrics cannot be opened; one line that says which."""
+
+
+class GatewayCollector(Collector):
+    """Makes metrics out of what the control thread has left, when somebody asks for them."""
+
+    def __init__(self, pulse: Pulse, logs: LogThread) -> None:
+        self._pulse = pulse
+        self._logs = logs
+
+    def collect(self) -> Iterator[Metric]:
+        """All metrics of the moment."""
+        pulse = self._pulse
+        yield _histogram("tick_lateness_seconds", "Time from the deadline of a tick to its begin.", pulse.lateness)
+        yield _histogram("step_cpu_seconds", "CPU time of a tick.", pulse.step_cpu)
+        yield _counter("ticks", "Ticks since the start.", pulse.ticks)
+        yield _counter("log_records_dropped", "Log records lost.", self._logs.dropped + pulse.events_dropped)
+        yield _labelled(
+            GaugeMetricFamily, "realtime_granted", "1 where what was asked of the machine was granted.", "what",
+            {name: float(not grant.refusal) for name, grant in pulse.realtime.items()},
+        )  # fmt: skip
+        if pulse.status is not None:
+            yield from _of_status(pulse.status)
+
+
+def _of_status(status: StatusSample) -> Iterable[Metric]:
+    return (
+        _labelled(GaugeMetricFamily, "mode", "1 for the present one.", "mode", {mode.name: mode.name == status.mode for mode in Mode}),
+        _counter("ticks_late", "Ticks skipped.", status.ticks_late),
+        _counter("frames_received", "Frames received.", status.frames_received),
+        _labelled(CounterMetricFamily, "frames_rejected", "Frames ignored.", "cause", status.frames_rejected),
+        _labelled(CounterMetricFamily, "commands_rejected", "Commands ignored.", "cause", status.commands_rejected),
+        _labelled(CounterMetricFamily, "frames_unsent", "Frames not sent.", "cause", status.frames_unsent),
+        _bus_states(status.buses),
+        _counter("ticks_unrecorded", "Ticks missing in the record.", status.ticks_unrecorded),
+        GaugeMetricFamily(_PREFIX + "blockers", "Conditions that keep the gateway from the next mode.", len(status.blockers)),
+        GaugeMetricFamily(_PREFIX + "command_age_seconds", "Age of the newest command.", status.command_age_ms * 1e-3),
+        _sha256(status.hashes),
+    )
+
+
+def _counter(name: str, text: str, value: float) -> Metric:
+    return CounterMetricFamily(_PREFIX + name, text, value)
+
+
+def _labelled(
+    kind: type[CounterMetricFamily | GaugeMetricFamily], name: str, text: str, label: str, values: dict[str, Any]
+) -> Metric:
+    family = kind(_PREFIX + name, text, labels=[label])
+    for entry, value in values.items():
+        family.add_metric([entry], value)
+    return family
+
+
+def _bus_states(buses: dict[str, str]) -> Metric:
+    family = GaugeMetricFamily(_PREFIX + "bus_state", "1 for the present state of our CAN controller.", labels=["bus", "state"])
+    for network, present in buses.items():
+        for state in BusState:
+            family.add_metric([network, state.value], float(state.value == present))
+    return family
+
+
+def _sha256(hashes: dict[str, str]) -> Metric:
+    family = GaugeMetricFamily(_PREFIX + "sha256", "1 for each thing that it works with.", labels=["name", "sha256"])
+    for name, digest in hashes.items():
+        family.add_metric([name, digest], 1.0)
+    return family
+
+
+def _histogram(name: str, text: str, histogram: Histogram) -> Metric:
+    bounds = [*(f"{bound_ns * _S_PER_NS:g}" for bound_ns in BUCKETS_NS), "+Inf"]
+    buckets = list(zip(bounds, accumulate(histogram.counts), strict=True))
+    return HistogramMetricFamily(_PREFIX + name, text, buckets=buckets, sum_value=histogram.sum_ns * _S_PER_NS)
+
+
+class _Handler(WSGIRequestHandler):
+    timeout = _REQUEST_TIMEOUT_S
+
+    def log_message(self, *_: object) -> None:
+        """Nothing: requests are no events."""
+
+
+class _Server(WSGIServer):
+    allow_reuse_port = False  # a second gateway must not share it unseen
+
+    def process_request(self, *arguments: Any) -> None:  # noqa: ANN401 - of the standard library
+        """Answer one request, and pause."""
+        super().process_request(*arguments)
+        time.sleep(_PAUSE_S)
+
+
+class MetricsServer:
+    """Serves the metrics of one gateway from a thread of its own, one request at a time.
+
+    Raises:
+        MetricsError: the port is not free.
+    """
+
+    def __init__(self, port: int, pulse: Pulse, logs: LogThread) -> None:
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(GatewayCollector(pulse, logs))
+        try:
+            self._server = make_server("127.0.0.1", port, make_wsgi_app(registry), _Server, _Handler)
+        except OSError as error:
+            raise MetricsError(f"metrics.port = {port}: {error.strerror or error}; allowed: a free port") from error
+        self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()

@@ -1,0 +1,191 @@
+"""Do the measurements contradict each other, or what the gateway asked for?
+
+Every frame may be fresh, whole and within its ranges, and its content still wrong: frozen, off, or of somebody else. So each signal
+that steers the car is held against another one that knows the same thing, for as long as honest ones may disagree.
+"""
+
+import math
+from collections import deque
+from statistics import median
+
+from dbc.vehicle import Vehicle
+from gateway.causes import Cause, Finding
+from gateway.codec import Measurement
+from gateway.limits import Demand
+
+SPEED_LIMIT_MPS, SPEED_LIMIT_SHARE = 2.0, 0.1
+"""Difference of the speeds of wheels and navigation: opendbc's 2 m/s, and above 72 km/h the slip at which anti-lock brakes hold wheels."""
+SPEED_HOLD_NS = 100_000_000
+
+MOTION_WINDOW_MS = 100
+"""Over this time position and heading are held against speed and yaw rate: ten measurements of the navigation system."""
+MOTION_HOLD_NS = 30_000_000
+"""A lost frame makes a difference for one cycle, two for two: 36 m/s are 0.36 m a cycle."""
+POSITION_LIMIT_M = 0.5
+"""A lane of 3.5 m leaves a car of 1.8 m twice as much on each side. In undisturbed drives 0.02 m."""
+YAW_RATE_LIMIT_RADPS = 0.2
+"""At 20 m/s a path that is 4 m/s2 off; a jump of the heading by 0.02 rad. In undisturbed drives 0.02 rad/s."""
+
+STEERING_RATE_SHARE = 1.25
+"""Of the fastest rate of the steering robot: faster is no motion. A sample more or less in a step of 10 ms is in the next two."""
+STEERING_SILENT_NS = 30_000_000
+"""An angle that has not changed for longer has stood still: two frames were lost at most."""
+FOLLOWING_NS = 100_000_000
+"""Time in which the robot has followed every demand, besides its dead time: three times its lag, and a step of the plan."""
+FOLLOWING_LIMIT_RAD = 0.05
+"""Steering-wheel angle beside everything demanded in that time: ten times what undisturbed drives show, six times the robot's lash."""
+FOLLOWING_HOLD_NS = 50_000_000
+
+PEDAL_LIMIT_NORM = 0.05
+"""A foot that is deeper than the robot by so much of the stroke wants to be: the robots judge by the same figure."""
+PEDAL_HOLD_NS = 100_000_000
+"""As Dataspeed: an override has a level and a time."""
+
+_NS_PER_S = 1e9
+
+
+class _Held:
+    """A contradiction that counts once it has lasted."""
+
+    def __init__(self, hold_ns: int) -> None:
+        self._hold_ns = hold_ns
+        self._since_ns: int | None = None
+
+    def update(self, now_ns: int, is_there: bool) -> bool:
+        """Whether it has been there for its time, without a break."""
+        if not is_there:
+            self._since_ns = None
+            return False
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        return now_ns - self._since_ns >= self._hold_ns
+
+
+class _Motion:
+    """Position and heading against what speed and yaw rate make of them, over the last `MOTION_WINDOW_MS` of navigation time.
+
+    What is measured less what the rates add up to is constant when both are right; it is kept for the window.
+    """
+
+    def __init__(self) -> None:
+        self._rows: deque[tuple[int, float, float, float]] = deque()
+        self._time_ms = -1
+        self._x_m = self._y_m = self._yaw_rad = self._turned_rad = 0.0
+        self.position_error_m = 0.0
+        self.yaw_rate_error_radps = 0.0
+
+    def update(self, m: Measurement) -> None:
+        """Take in a measurement with a new time of validity."""
+        elapsed_ms = m.navigation_time_ms - self._time_ms
+        if self._time_ms < 0 or not 0 < elapsed_ms <= MOTION_WINDOW_MS:
+            self._rows.clear()
+        else:
+            self._advance(m, elapsed_ms * 1e-3)
+        self._time_ms, self._yaw_rad = m.navigation_time_ms, m.yaw_rad
+        self._rows.append((self._time_ms, m.x_m - self._x_m, m.y_m - self._y_m, self._turned_rad))
+        while self._time_ms - self._rows[0][0] > MOTION_WINDOW_MS:
+            self._rows.popleft()
+        _, x_m, y_m, turned_rad = self._rows[0]
+        self.position_error_m = math.hypot(m.x_m - self._x_m - x_m, m.y_m - self._y_m - y_m)
+        self.yaw_rate_error_radps = (self._turned_rad - turned_rad) / (MOTION_WINDOW_MS * 1e-3)
+
+    def _advance(self, m: Measurement, elapsed_s: float) -> None:
+        """Go on with the measured rates; the heading counts as how much it has turned more than the yaw rate says."""
+        cosine, sine = math.cos(m.yaw_rad), math.sin(m.yaw_rad)
+        self._x_m += (m.vx_mps * cosine - m.vy_mps * sine) * elapsed_s
+        self._y_m += (m.vx_mps * sine + m.vy_mps * cosine) * elapsed_s
+        self._turned_rad += math.remainder(m.yaw_rad - self._yaw_rad, math.tau) - m.yaw_rate_radps * elapsed_s
+
+
+class Plausibility:
+    """Compares what is measured.
+
+    Args:
+        is_on_lift: the wheels turn without the road; their speed then says nothing about the car's.
+    """
+
+    def __init__(self, vehicle: Vehicle, *, is_on_lift: bool = False) -> None:
+        robot = vehicle.robots.steering
+        self._is_on_lift = is_on_lift
+        self._wheel_radius_m = vehicle.model.wheel_radius_m
+        self._steering_limit_radps = STEERING_RATE_SHARE * robot.rate_limit_radps
+        self._following_ns = FOLLOWING_NS + round(robot.dead_time_s * _NS_PER_S)
+        self._motion = _Motion()
+        self._navigation_time_ms = -1
+        self._steering_rad: float | None = None
+        self._steered_ns = 0
+        self._demands_rad: deque[tuple[int, float]] = deque()
+        self._speed = _Held(SPEED_HOLD_NS)
+        self._position, self._yaw_rate = _Held(MOTION_HOLD_NS), _Held(MOTION_HOLD_NS)
+        self._following = _Held(FOLLOWING_HOLD_NS)
+        self._brake, self._accelerator = _Held(PEDAL_HOLD_NS), _Held(PEDAL_HOLD_NS)
+
+    def update(self, now_ns: int, measurement: Measurement, demand: Demand, is_driving: bool) -> list[Finding]:
+        """What is contradictory now.
+
+        Args:
+            demand: what the robots were asked for last.
+            is_driving: whether they are to follow it.
+        """
+        found = self._judge_steering_rate(now_ns, measurement)
+        if measurement.navigation_time_ms >= 0:
+            found += self._judge_navigation(now_ns, measurement)
+        if is_driving:
+            found += self._judge_following(now_ns, measurement, demand)
+            found += self._judge_pedals(now_ns, measurement)
+        else:
+            self._demands_rad.clear()
+            for held in (self._following, self._brake, self._accelerator):
+                held.update(now_ns, False)
+        return found
+
+    def _judge_navigation(self, now_ns: int, m: Measurement) -> list[Finding]:
+        if m.navigation_time_ms != self._navigation_time_ms:
+            self._navigation_time_ms = m.navigation_time_ms
+            self._motion.update(m)
+        wheels_mps = median(m.wheel_speed_radps) * self._wheel_radius_m
+        speed_limit_mps = max(SPEED_LIMIT_MPS, SPEED_LIMIT_SHARE * abs(m.vx_mps))
+        checks = (
+            (self._speed, Cause.SPEED_IMPLAUSIBLE, 0.0 if self._is_on_lift else wheels_mps - m.vx_mps, speed_limit_mps),
+            (self._position, Cause.POSITION_IMPLAUSIBLE, self._motion.position_error_m, POSITION_LIMIT_M),
+            (self._yaw_rate, Cause.YAW_RATE_IMPLAUSIBLE, self._motion.yaw_rate_error_radps, YAW_RATE_LIMIT_RADPS),
+        )
+        return [
+            Finding(cause, abs(error), limit, "navigation")
+            for held, cause, error, limit in checks
+            if held.update(now_ns, abs(error) > limit)
+        ]
+
+    def _judge_steering_rate(self, now_ns: int, m: Measurement) -> list[Finding]:
+        before_rad, before_ns = self._steering_rad, self._steered_ns
+        if m.steering_wheel_rad == before_rad:
+            return []
+        self._steering_rad, self._steered_ns = m.steering_wheel_rad, now_ns
+        if before_rad is None:
+            return []
+        elapsed_s = min(now_ns - before_ns, STEERING_SILENT_NS) / _NS_PER_S
+        rate_radps = abs(m.steering_wheel_rad - before_rad) / elapsed_s
+        if rate_radps <= self._steering_limit_radps:
+            return []
+        return [Finding(Cause.STEERING_IMPLAUSIBLE, rate_radps, self._steering_limit_radps, "SR")]
+
+    def _judge_following(self, now_ns: int, m: Measurement, demand: Demand) -> list[Finding]:
+        self._demands_rad.append((now_ns, demand.steering_wheel_rad))
+        while now_ns - self._demands_rad[0][0] > self._following_ns:
+            self._demands_rad.popleft()
+        demanded_rad = [angle_rad for _, angle_rad in self._demands_rad]
+        error_rad = max(m.steering_wheel_rad - max(demanded_rad), min(demanded_rad) - m.steering_wheel_rad)
+        if not self._following.update(now_ns, error_rad > FOLLOWING_LIMIT_RAD):
+            return []
+        return [Finding(Cause.STEERING_NOT_FOLLOWING, error_rad, FOLLOWING_LIMIT_RAD, "SR")]
+
+    def _judge_pedals(self, now_ns: int, m: Measurement) -> list[Finding]:
+        feet = (
+            (self._brake, Cause.DRIVER_BRAKES, m.brake_pedal_norm - m.brake_norm),
+            (self._accelerator, Cause.DRIVER_ACCELERATES, m.accelerator_pedal_norm - m.accelerator_norm),
+        )
+        return [
+            Finding(cause, deeper_norm, PEDAL_LIMIT_NORM, "CAR_Powertrain")
+            for held, cause, deeper_norm in feet
+            if held.update(now_ns, deeper_norm > PEDAL_LIMIT_NORM)
+        ]

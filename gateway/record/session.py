@@ -1,0 +1,71 @@
+"""What a record tells of the session that it is of: versions, hashes, clocks."""
+
+import hashlib
+import importlib.metadata
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypedDict
+
+from gateway.journal import GatewaySession, pack_value
+from gateway.limits import LimitProfile
+
+_EARLIEST_NS = 946_684_800_000_000_000
+"""The year 2000 [ns]: a machine without a clock of its own starts in 1970, which the BLF format cannot tell."""
+
+
+class Origin(TypedDict):
+    """The fields of `gateway.journal.Session` that every session has."""
+
+    version: str
+    started_utc: str
+    wall_offset_ns: int
+    boot_id: int
+    sha256: dict[str, str]
+
+
+def origin(boot_id: int, decided_by: Mapping[str, bytes]) -> Origin:
+    """Version, clocks, and hashes of what decides on what a process does."""
+    wall_ns = max(time.time_ns(), _EARLIEST_NS)
+    return Origin(
+        version=importlib.metadata.version("xilgate"),
+        started_utc=datetime.fromtimestamp(wall_ns / 1e9, UTC).isoformat(timespec="milliseconds"),
+        wall_offset_ns=wall_ns - time.monotonic_ns(),
+        boot_id=boot_id,
+        sha256={name: hashlib.sha256(content).hexdigest() for name, content in decided_by.items()},
+    )
+
+
+def gateway_session(
+    boot_id: int,
+    profile: LimitProfile,
+    dbc_paths: Iterable[Path],
+    vehicle_path: Path,
+    configuration: dict[str, Any],
+    *,
+    mapping_path: Path | None = None,
+) -> GatewaySession:
+    """What a gateway is started with, as the journal keeps it.
+
+    Args:
+        configuration: the effective configuration, of what JSON can carry and without any key.
+
+    Raises:
+        OSError: a file cannot be read.
+    """
+    dbc = {path.name: path.read_bytes() for path in dbc_paths}
+    limits, vehicle = asdict(profile), vehicle_path.read_bytes()
+    decided_by = dbc | {"vehicle": vehicle, "limits": pack_value(limits), "configuration": pack_value(configuration)}
+    if mapping_path is not None:
+        decided_by["mapping"] = mapping_path.read_bytes()
+    return GatewaySession(
+        **origin(boot_id, decided_by),
+        profile=profile.name,
+        limits=limits,
+        dbc={name: content.decode("latin-1") for name, content in dbc.items()},
+        mapping=None if mapping_path is None else decided_by["mapping"].decode("utf-8"),
+        vehicle=vehicle.decode("utf-8"),
+        configuration=configuration,
+    )

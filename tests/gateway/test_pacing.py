@@ -1,0 +1,67 @@
+"""When the gateway steps."""
+
+import random
+
+from gateway.pacing import DRIFT_NS, PULL_NS, SHIFT_NS, Pacer
+
+MS = 1_000_000
+PERIOD_NS = 10 * MS
+POLL_NS = MS // 2
+
+
+def run(seconds, arrivals_ns, stall=(0, 0)):
+    """Times of the steps, and how long each command waited; polled every half millisecond, but not within a stall."""
+    pacer, steps, waits, pending = Pacer(0, PERIOD_NS), [], [], []
+    arrivals = iter([*arrivals_ns, 1 << 62])
+    next_arrival = next(arrivals)
+    for now_ns in range(POLL_NS, round(seconds * 1e9), POLL_NS):
+        if stall[0] <= now_ns < stall[1]:
+            continue
+        while next_arrival <= now_ns:
+            pacer.command_arrived(now_ns)
+            pending.append(next_arrival)
+            next_arrival = next(arrivals)
+        if pacer.is_due(now_ns, bool(pending)):
+            waits += [now_ns - arrival for arrival in pending]
+            pending.clear()
+            steps.append(now_ns)
+            pacer.stepped(now_ns)
+    return pacer, steps, waits
+
+
+def gaps(steps):
+    return [after - before for before, after in zip(steps, steps[1:], strict=False)]
+
+
+def test_without_commands_the_grid_is_exact():
+    pacer, steps, _ = run(10.0, [])
+    assert steps == [PERIOD_NS * k for k in range(1, 1000)]
+    assert pacer.overruns == 0
+
+
+def test_commands_of_any_phase_are_soon_answered_as_they_arrive():
+    for phase_ns in range(0, 10 * MS, MS // 4):
+        jitter = random.Random(phase_ns)
+        arrivals = [500 * MS + phase_ns + 40 * MS * k + jitter.randint(0, MS // 2) for k in range(200)]
+        _, steps, waits = run(8.5, arrivals)
+        settled = sorted(waits[20:])
+        assert settled[len(settled) // 2] <= POLL_NS
+        assert settled[int(0.99 * len(settled))] <= 2 * POLL_NS
+        assert min(gaps(steps)) >= PERIOD_NS - PULL_NS
+        assert max(gaps(steps)) <= PERIOD_NS + SHIFT_NS + DRIFT_NS + POLL_NS
+
+
+def test_the_rate_stays_within_a_fifth_of_the_nominal_one_whatever_comes():
+    jitter = random.Random(1)
+    arrivals = sorted(jitter.randint(0, 5_000 * MS) for _ in range(3_000))
+    _, steps, _ = run(5.0, arrivals)
+    assert min(gaps(steps)) >= PERIOD_NS - PULL_NS
+    assert max(gaps(steps)) <= PERIOD_NS + SHIFT_NS + DRIFT_NS + POLL_NS
+    assert len(steps) <= 1.2 * 500
+    assert len(steps) >= 0.8 * 500
+
+
+def test_a_stall_is_skipped_and_counted():
+    pacer, steps, _ = run(1.0, [], stall=(95 * MS, 345 * MS))
+    assert pacer.overruns == 24
+    assert [step for step in steps if step >= 90 * MS][:4] == [90 * MS, 345 * MS, 350 * MS, 360 * MS]
