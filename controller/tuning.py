@@ -116,7 +116,7 @@ class TuningService:
         """The answer to one request; to what is none, a refusal that says why."""
         try:
             request = _REQUESTS.decode(payload)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, RecursionError) as error:
             return self._encoder.encode(Refused(reasons=[f"not a request: {error}"]))
         with self._lock:
             return self._encoder.encode(self._answer(request))

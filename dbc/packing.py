@@ -91,13 +91,15 @@ class Field(NamedTuple):
     """A signal: what it may be.
 
     Args:
-        low, high: smallest and largest value of the DBC that the bits can hold, wider by what rounding takes back: factors are
-            decimal, floats are not.
+        minimum, maximum: smallest and largest value of the DBC that the bits can hold.
+        low, high: these, wider by what rounding takes back: factors are decimal, floats are not.
         neutral: zero, or the nearest value that the signal can take: a database need not give start values.
         sign: value of the sign bit; 0 for a signal without.
     """
 
     name: str
+    minimum: float
+    maximum: float
     low: float
     high: float
     neutral: float
@@ -115,7 +117,8 @@ class Field(NamedTuple):
         maximum = maximum if signal.maximum is None else min(maximum, signal.maximum)
         slack = 0.0 if signal.is_float else 0.499 * abs(signal.scale)
         neutral = min(max(0.0, minimum), maximum)
-        return cls(signal.name, minimum - slack, maximum + slack, neutral, mask, sign, signal.scale, signal.offset)
+        low, high = minimum - slack, maximum + slack
+        return cls(signal.name, minimum, maximum, low, high, neutral, mask, sign, signal.scale, signal.offset)
 
 
 def packing_of(message: Message) -> Packing:
@@ -147,6 +150,7 @@ class _Shifts:
         # Plain tuples: they unpack in a third of the time of named ones.
         self._unpacking = [(f.name, f.low, f.high, shift, f.mask, f.sign, f.scale, f.offset) for f, shift in placed]
         self._packing = {f.name: (f.low, f.high, shift, f.mask, ~(f.mask << shift), f.scale, f.offset) for f, shift in placed}
+        self._ends = {f.name: (f.minimum, f.maximum) for f in fields}
         self._neutral_word = 0
         self._neutral_word = self._word({f.name: f.neutral for f in fields}, saturates=False)
 
@@ -160,7 +164,8 @@ class _Shifts:
             if low <= given <= high:
                 value = given
             elif saturates and not math.isnan(given):
-                value = low if given < low else high
+                minimum, maximum = self._ends[name]
+                value = maximum if given > high else minimum
             else:
                 raise EncodeError(_outside(self._name, name, given, low, high))
             word = word & others | (round((value - offset) / scale) & mask) << shift
@@ -190,7 +195,8 @@ class _Cantools:
             complete.update(self._pages[name])
         complete.update(values)
         if saturates:
-            complete = {name: min(max(value, self._fields[name].low), self._fields[name].high) for name, value in complete.items()}
+            ends = {name: (self._fields[name].minimum, self._fields[name].maximum) for name in complete}
+            complete = {name: min(max(value, ends[name][0]), ends[name][1]) for name, value in complete.items()}
         self._check(complete, EncodeError)
         try:
             # Its own strict check says the same at three times the cost.

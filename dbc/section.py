@@ -91,7 +91,7 @@ def _quoted_line(text: str, message: str) -> str:
 
 
 def _mistake(path: Path, content: type[Section], details: ErrorDetails) -> str:
-    key = ".".join(map(str, details["loc"])) or content.__name__.lower()
+    key = ".".join(str(part) if str(part).isprintable() else ascii(part) for part in details["loc"]) or content.__name__.lower()
     if details["type"] == "missing":
         return f"{path}: {key}: missing"
     if details["type"] == "extra_forbidden":

@@ -148,33 +148,36 @@ class Channel(_Socket):
     def __init__(self, bind: Path, peer: Path, key: bytes) -> None:
         super().__init__(key)
         self._peer = str(peer)
-        self._is_connected = False
         self._newest: dict[type, VehicleState | ControlCommand] = {}
         self._bind(bind)
+        self._connect()
 
     def send(self, message: VehicleState | ControlCommand) -> None:
         """Send a message, or count it when the peer is absent or does not keep up."""
-        self._connect()
-        try:
-            self._socket.send(pack(message, self._key))
-        except BlockingIOError:
-            self.unsent += 1
-        except OSError:
-            self._is_connected = False
-            self.unsent += 1
+        datagram = pack(message, self._key)
+        if not self._send(datagram):
+            self._connect()
+            self.unsent += not self._send(datagram)
 
     def newest(self, kind: type[T]) -> T | None:
         """The newest message of a kind that has arrived since it was last asked for, or None."""
-        self._connect()
         self._poll()
         message = self._newest.pop(kind, None)
+        if message is None:
+            self._connect()
         return message if isinstance(message, kind) else None
 
     def _connect(self) -> None:
-        if not self._is_connected:
-            with contextlib.suppress(OSError):  # not there yet; sending says so
-                self._socket.connect(self._peer)
-                self._is_connected = True
+        """Let in whoever has the peer's name now; nothing tells that it has become another process."""
+        with contextlib.suppress(OSError):  # not there yet
+            self._socket.connect(self._peer)
+
+    def _send(self, datagram: bytes) -> bool:
+        try:
+            self._socket.send(datagram)
+        except OSError:
+            return False
+        return True
 
     def _poll(self) -> None:
         for _ in range(MAX_DATAGRAMS_PER_POLL):
@@ -182,8 +185,7 @@ class Channel(_Socket):
                 datagram = self._socket.recv(MAX_DATAGRAM_BYTES + 1)
             except BlockingIOError:
                 return
-            except ConnectionError:  # the peer has gone; another may be there already
-                self._is_connected = False
+            except ConnectionError:  # the peer has chosen another one; what came since is still there
                 continue
             message = unpack(datagram, self._key)
             if isinstance(message, VehicleState | ControlCommand):

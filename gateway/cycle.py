@@ -85,7 +85,7 @@ class ControlCycle:
         return Surroundings(health, self._record.is_recording, self._record.disk_free_share)
 
     def _answer(self, reply: OperatorReply) -> None:
-        if reply.operation is Operation.RESET and not reply.refusals:
+        if reply.operation is Operation.RESET:  # a bus-off that is still there must not keep it from being left
             self._links.buses.recover()
         if reply.boot_id != self._boot_id:
             self._links.operators.reply(reply)
@@ -108,6 +108,7 @@ class ControlCycle:
 
     def _process(self, overruns: int, cpu_ns: int) -> Process:
         buses = self._links.buses
+        rejected = {"controller": self._links.channel.rejected, "operator": self._links.operators.rejected}
         return Process(
             ticks_late=overruns,
             step_cpu_ms=cpu_ns * 1e-6,
@@ -115,6 +116,7 @@ class ControlCycle:
             frames_dropped=buses.dropped,
             frames_unsent=buses.unsent,
             links=buses.health(),
+            datagrams_rejected={f"no datagram of the {sender}'s": count for sender, count in rejected.items() if count},
             ticks_unrecorded=self._record.lost,
             record_problem=self._record.problem,
             realtime=self._realtime,

@@ -1,6 +1,7 @@
 """The life of the gateway's process: signals, logs, the service manager, and one gateway after another as its configuration changes."""
 
 import contextlib
+import logging
 import signal
 import time
 from collections.abc import Callable
@@ -10,6 +11,8 @@ from gateway.housekeeping import Orders
 from gateway.logs import LogThread
 from gateway.preparation import Preparation
 from gateway.systemd import Notifier
+
+log = logging.getLogger("xilgate.gateway")
 
 
 def serve(preparation: Preparation, logs: LogThread, prepare: Callable[[], Preparation] | None = None) -> None:
@@ -27,10 +30,14 @@ def serve(preparation: Preparation, logs: LogThread, prepare: Callable[[], Prepa
     orders = Orders()
     _heed_signals(orders)
     with contextlib.closing(Notifier()) as notifier:
-        following = run(preparation, orders, notifier, logs, prepare)
+        following: Preparation | None = preparation
         while following is not None:
-            notifier.reloading(time.monotonic_ns())
+            rig = following.rig
+            log.info("%s begins with limits %s", rig.name, rig.profile, extra={"profile": rig.profile, "sha256": dict(following.hashes)})
             following = run(following, orders, notifier, logs, prepare)
+            if following is not None:
+                notifier.reloading(time.monotonic_ns())
+    log.info("%s ended", rig.name)
 
 
 def _heed_signals(orders: Orders) -> None:

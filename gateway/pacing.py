@@ -1,8 +1,9 @@
 """When the gateway steps: once a period, in step with the commands.
 
-A command that had to wait for the next tick of a free-running loop would wait half a period on average. So the loop runs a little slow while
-commands come, and a command that arrives shortly before the deadline pulls the step forward to itself: from then on nearly every
-command is answered on the bus as it arrives. No two steps are closer than the messages' rate allows, and a stall is skipped, not caught up with.
+A command that had to wait for the next tick of a free-running loop would wait half a period on average. So the loop runs a
+little slow while commands come, and a command that arrives shortly before the deadline pulls the step forward to itself: from
+then on nearly every command is answered on the bus as it arrives. No two steps are closer than the messages' rate allows, and
+a stall is skipped, not caught up with.
 """
 
 PULL_NS = 1_500_000

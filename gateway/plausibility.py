@@ -11,7 +11,7 @@ from statistics import median
 from dbc.vehicle import Vehicle
 from gateway.causes import Cause, Finding
 from gateway.codec import Measurement
-from gateway.limits import Demand
+from gateway.limits import Demand, clamp
 
 SPEED_LIMIT_MPS, SPEED_LIMIT_SHARE = 2.0, 0.1
 """Difference of the speeds of wheels and navigation: opendbc's 2 m/s, and above 72 km/h the slip at which anti-lock brakes hold wheels."""
@@ -21,15 +21,16 @@ MOTION_WINDOW_MS = 100
 """Over this time position and heading are held against speed and yaw rate: ten measurements of the navigation system."""
 MOTION_HOLD_NS = 30_000_000
 """A lost frame makes a difference for one cycle, two for two: 36 m/s are 0.36 m a cycle."""
-POSITION_LIMIT_M = 0.5
-"""A lane of 3.5 m leaves a car of 1.8 m twice as much on each side. In undisturbed drives 0.02 m."""
-YAW_RATE_LIMIT_RADPS = 0.2
-"""At 20 m/s a path that is 4 m/s2 off; a jump of the heading by 0.02 rad. In undisturbed drives 0.02 rad/s."""
+POSITION_LIMITS_M = (0.2, 0.5)
+"""Half of the way that the car makes in the window, so that a position that stands still is found, within these: the usable position
+modes are good to 0.2 m, and a lane of 3.5 m leaves a car of 1.8 m 0.85 m on each side. In undisturbed drives 0.02 m."""
+YAW_RATE_LIMIT_RADPS = 0.1
+"""At 20 m/s a path that is 2 m/s2 off; a jump of the heading by 0.01 rad. In undisturbed drives 0.02 rad/s."""
 
 STEERING_RATE_SHARE = 1.25
-"""Of the fastest rate of the steering robot: faster is no motion. A sample more or less in a step of 10 ms is in the next two."""
-STEERING_SILENT_NS = 30_000_000
-"""An angle that has not changed for longer has stood still: two frames were lost at most."""
+"""Of the fastest rate of the steering robot: faster is no motion. Twice the rate that profiles allow, for two frames in one cycle."""
+STEERING_STEP_NS = (10_000_000, 30_000_000)
+"""Time that a step of the angle took: a cycle of its message, or three when two were lost. An angle that did not change stood still."""
 FOLLOWING_NS = 100_000_000
 """Time in which the robot has followed every demand, besides its dead time: three times its lag, and a step of the plan."""
 FOLLOWING_LIMIT_RAD = 0.05
@@ -127,14 +128,16 @@ class Plausibility:
             demand: what the robots were asked for last.
             is_driving: whether they are to follow it.
         """
+        self._demands_rad.append((now_ns, demand.steering_wheel_rad))
+        while now_ns - self._demands_rad[0][0] > self._following_ns:
+            self._demands_rad.popleft()
         found = self._judge_steering_rate(now_ns, measurement)
         if measurement.navigation_time_ms >= 0:
             found += self._judge_navigation(now_ns, measurement)
         if is_driving:
-            found += self._judge_following(now_ns, measurement, demand)
+            found += self._judge_following(now_ns, measurement)
             found += self._judge_pedals(now_ns, measurement)
         else:
-            self._demands_rad.clear()
             for held in (self._following, self._brake, self._accelerator):
                 held.update(now_ns, False)
         return found
@@ -145,9 +148,10 @@ class Plausibility:
             self._motion.update(m)
         wheels_mps = median(m.wheel_speed_radps) * self._wheel_radius_m
         speed_limit_mps = max(SPEED_LIMIT_MPS, SPEED_LIMIT_SHARE * abs(m.vx_mps))
+        position_limit_m = clamp(0.5 * abs(m.vx_mps) * MOTION_WINDOW_MS * 1e-3, *POSITION_LIMITS_M)
         checks = (
             (self._speed, Cause.SPEED_IMPLAUSIBLE, 0.0 if self._is_on_lift else wheels_mps - m.vx_mps, speed_limit_mps),
-            (self._position, Cause.POSITION_IMPLAUSIBLE, self._motion.position_error_m, POSITION_LIMIT_M),
+            (self._position, Cause.POSITION_IMPLAUSIBLE, self._motion.position_error_m, position_limit_m),
             (self._yaw_rate, Cause.YAW_RATE_IMPLAUSIBLE, self._motion.yaw_rate_error_radps, YAW_RATE_LIMIT_RADPS),
         )
         return [
@@ -163,16 +167,13 @@ class Plausibility:
         self._steering_rad, self._steered_ns = m.steering_wheel_rad, now_ns
         if before_rad is None:
             return []
-        elapsed_s = min(now_ns - before_ns, STEERING_SILENT_NS) / _NS_PER_S
+        elapsed_s = clamp(now_ns - before_ns, *STEERING_STEP_NS) / _NS_PER_S
         rate_radps = abs(m.steering_wheel_rad - before_rad) / elapsed_s
         if rate_radps <= self._steering_limit_radps:
             return []
         return [Finding(Cause.STEERING_IMPLAUSIBLE, rate_radps, self._steering_limit_radps, "SR")]
 
-    def _judge_following(self, now_ns: int, m: Measurement, demand: Demand) -> list[Finding]:
-        self._demands_rad.append((now_ns, demand.steering_wheel_rad))
-        while now_ns - self._demands_rad[0][0] > self._following_ns:
-            self._demands_rad.popleft()
+    def _judge_following(self, now_ns: int, m: Measurement) -> list[Finding]:
         demanded_rad = [angle_rad for _, angle_rad in self._demands_rad]
         error_rad = max(m.steering_wheel_rad - max(demanded_rad), min(demanded_rad) - m.steering_wheel_rad)
         if not self._following.update(now_ns, error_rad > FOLLOWING_LIMIT_RAD):

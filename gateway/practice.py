@@ -22,9 +22,9 @@ def realtime_practice(wanted: Realtime) -> Iterator[Mapping[str, Grant]]:
     memory = lock_memory() if wanted.locks_memory else Grant("memory not locked")
     grants = {"memory": memory, "processors": pin_to(wanted.cpus), "priority": become_realtime(wanted.priority)}
     lift_helpers()
-    for grant in grants.values():
+    for name, grant in grants.items():
         if grant.refusal:
-            log.warning("%s; `xilgate doctor` says how to get it", grant)
+            log.warning("%s; `xilgate doctor` says how to get it", grant, extra={"asked": name})
     try:
         yield grants
     finally:

@@ -23,6 +23,7 @@ class Process:
         frames_dropped: received frames that the core was not shown, by cause.
         frames_unsent: frames that were to be sent and were not, by cause.
         links: health of the bus of every network.
+        datagrams_rejected: on the control sockets, by cause.
         ticks_unrecorded, record_problem: see `gateway.recorder.RecorderStatus`.
         realtime: what the control thread asked of the machine, and what it was refused.
         hashes: SHA-256 of all that it works with.
@@ -34,6 +35,7 @@ class Process:
     frames_dropped: Mapping[str, int] = field(default_factory=dict)
     frames_unsent: Mapping[str, int] = field(default_factory=dict)
     links: Mapping[str, LinkHealth] = field(default_factory=dict)
+    datagrams_rejected: Mapping[str, int] = field(default_factory=dict)
     ticks_unrecorded: int = 0
     record_problem: str = ""
     realtime: Mapping[str, str] = field(default_factory=dict)
@@ -97,7 +99,7 @@ def _status(seq: int, core: GatewayCore, now_ns: int, process: Process) -> Statu
         command_age_ms=min(core.commands.age_ns(now_ns) * 1e-6, 1e6),
         frames_received=core.supervisor.received,
         frames_rejected={**core.supervisor.rejected, **process.frames_dropped},
-        commands_rejected=dict(core.commands.rejected),
+        commands_rejected={**core.commands.rejected, **process.datagrams_rejected},
         ticks=core.ticks,
         ticks_late=process.ticks_late,
         step_cpu_ms=process.step_cpu_ms,

@@ -84,5 +84,5 @@ class TransmitGate:
     def _reject_motion(self, may_move: bool, robot_mode: str | None, values: Mapping[str, float]) -> str | None:
         if robot_mode not in _NEUTRAL_MODES + _POSITION_MODES or any(values[name] for name in _EFFORTS if name in values):
             return "robot mode"
-        is_neutral = robot_mode in _NEUTRAL_MODES and not values["Enable"] and not any(values[name] for name in _POSITIONS if name in values)
-        return None if may_move or is_neutral else "not neutral"
+        is_still = not values["Enable"] and not any(values[name] for name in _POSITIONS if name in values)
+        return None if may_move or (robot_mode in _NEUTRAL_MODES and is_still) else "not neutral"

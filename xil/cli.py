@@ -121,6 +121,7 @@ def controller(
     solver: SolverOption = None,
     control: ControlOption = None,
     key: KeyOption = None,
+    journal: Annotated[Path | None, typer.Option("--journal", help="directory for what `xilgate resim` needs of the controller")] = None,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
 ) -> None:
     """The controller process: planner and NMPC at 25 Hz."""
@@ -134,6 +135,7 @@ def controller(
             control=control_path(control, key),
             solver=solver or m.DEFAULT_SOLVER,
             telemetry_base_port=telemetry_port,
+            journal=journal,
         ),
     )
 

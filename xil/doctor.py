@@ -11,12 +11,14 @@ from pathlib import Path
 from rich.table import Table
 
 from dbc.build import BuildError, find_compiler
+from dbc.realtime import GATEWAY_PRIORITY, take_priority
 from xil.bus import socketcan_problem
 
 _CAN_INTERFACES = ("vcan0", "vcan1", "can0", "can1")
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "firefox")
 _PROC_STATUS = Path("/proc/self/status")
 _SYS_REALTIME = Path("/sys/kernel/realtime")
+_SYS_ISOLATED = Path("/sys/devices/system/cpu/isolated")
 # From Linux's capability.h.
 _CAP_IPC_LOCK = 14
 # Plant, gateway and controller each want a core in a real-time run; two do, with the plant beside one of them.
@@ -51,6 +53,7 @@ def checks() -> list[Check]:
         *(_can_interface(interface) for interface in _CAN_INTERFACES),
         _realtime_priority(),
         _memory_locking(),
+        _control_processor(),
         _preempt_rt(),
         _browser(),
     ]
@@ -114,24 +117,16 @@ def _realtime_priority() -> Check:
     return _check(
         "real-time priority",
         is_permitted,
-        "SCHED_FIFO permitted" if is_permitted else f"SCHED_FIFO refused, rtprio limit {limit}",
-        "rtprio 80 for your user in /etc/security/limits.conf, or LimitRTPRIO=80 in the service unit; then log in again",
+        f"SCHED_FIFO {GATEWAY_PRIORITY} permitted" if is_permitted else f"SCHED_FIFO {GATEWAY_PRIORITY} refused, rtprio limit {limit}",
+        f"rtprio {GATEWAY_PRIORITY} for your user in /etc/security/limits.conf, or LimitRTPRIO={GATEWAY_PRIORITY} in the service unit; "
+        "then log in again",
     )
 
 
 def _may_use_fifo() -> bool:
-    """Whether a thread may ask for SCHED_FIFO: tried in a thread that ends at once, since limits and capabilities do not tell all."""
+    """Whether a thread may have the gateway's priority: tried in one that ends at once, since limits and capabilities do not tell all."""
     outcome: list[bool] = []
-
-    def attempt() -> None:
-        try:
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(os.sched_get_priority_min(os.SCHED_FIFO)))
-        except OSError:
-            outcome.append(False)
-        else:
-            outcome.append(True)
-
-    thread = threading.Thread(target=attempt)
+    thread = threading.Thread(target=lambda: outcome.append(not take_priority(GATEWAY_PRIORITY).refusal))
     thread.start()
     thread.join()
     return outcome[0]
@@ -153,6 +148,19 @@ def _effective_capabilities() -> int:
         if line.startswith("CapEff:"):
             return int(line.split()[1], base=16)
     return 0
+
+
+def _control_processor() -> Check:
+    try:
+        isolated = _SYS_ISOLATED.read_text(encoding="ascii").strip()
+    except OSError:
+        isolated = ""
+    return _check(
+        "processor for control",
+        bool(isolated),
+        f"isolated: {isolated}" if isolated else "none isolated",
+        "on the target: isolcpus=1 on the kernel command line, and cpus = [1] in the rig file; without it others run there as well",
+    )
 
 
 def _preempt_rt() -> Check:

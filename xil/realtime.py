@@ -135,7 +135,8 @@ class RealtimeRun:
             self._announce(f"virtual world: http://127.0.0.1:{setup.view_port}/")
         processes.start("gateway", ["gateway", *buses, *contract, *sockets])
         reference = ["--reference", str(setup.reference_csv), "--solver", setup.solver]
-        processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets])
+        journal = ["--journal", str(setup.directory)]
+        processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets, *journal])
         # The car starts last: in a rolling start every second counts that the others take to come up.
         self._await(processes, "gateway", lambda: self._recording.latest("status") is not None)
         self._await(processes, "controller", control.controller_socket.exists)

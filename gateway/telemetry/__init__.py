@@ -25,6 +25,7 @@ import zenoh
 from dbc.errors import SetupFailure
 from gateway.keys import check_secret
 from gateway.telemetry.samples import (
+    MAX_SAMPLE_BYTES,
     TOPICS,
     CommandSample,
     FaultSample,
@@ -51,6 +52,7 @@ __all__ = [
     "DEFAULT_BASE_PORT",
     "KEY_PREFIX",
     "MAX_REQUEST_BYTES",
+    "MAX_SAMPLE_BYTES",
     "TOPICS",
     "CommandSample",
     "FaultSample",
@@ -257,6 +259,7 @@ def ask(
     request: bytes,
     base_port: int = DEFAULT_BASE_PORT,
     timeout_s: float = 2.0,
+    *,
     tls: TlsSection | None = None,
 ) -> bytes:
     """Send a request to a service of a running process, once, and wait for the answer.

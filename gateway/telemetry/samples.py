@@ -5,6 +5,10 @@ from enum import StrEnum
 import msgspec
 
 
+MAX_SAMPLE_BYTES = 1 << 22
+"""Longest payload that is looked at [bytes]: a scene with some 30,000 points."""
+
+
 class Source(StrEnum):
     """A process that publishes. Its port is the base port plus its place in this list.
 
@@ -295,7 +299,9 @@ def topic_of(sample: Sample) -> str:
 
 def decode(topic: str, payload: bytes) -> Sample | None:
     """The sample in a payload, or None when it is not one."""
+    if len(payload) > MAX_SAMPLE_BYTES:
+        return None
     try:
         return msgspec.json.decode(payload, type=TOPICS[topic][1])
-    except (msgspec.DecodeError, KeyError):
+    except (msgspec.DecodeError, RecursionError, KeyError):
         return None

@@ -1,7 +1,6 @@
 """The journal: what goes in comes out, what is cut or garbled ends clearly, whatever it says of itself."""
 
 import io
-import random
 import struct
 import tracemalloc
 import zlib
@@ -32,6 +31,15 @@ from tests.support.drive import GatewayDrive
 def read(content):
     reader = JournalReader(io.BytesIO(content), "a.journal")
     return list(reader), reader.is_cut
+
+
+def mistake(call, *arguments):
+    """What a call says of what it was given; nothing when it takes it."""
+    try:
+        call(*arguments)
+    except JournalError as error:
+        return str(error)
+    return ""
 
 
 def steps(count):
@@ -97,34 +105,26 @@ def test_a_cut_file_is_good_up_to_its_last_whole_block(length):
 def test_a_wrong_byte_is_one_clear_error(place, difference):
     garbled = bytearray(CONTENT)
     garbled[place] ^= difference
-    try:
+    if not (said := mistake(read, bytes(garbled))):
+        # Only a length that points beyond the end cannot be told from a cut.
         records, is_cut = read(bytes(garbled))
-    except JournalError as error:
-        assert str(error).startswith("a.journal: byte ")
-        return
-    # Only a length that points beyond the end cannot be told from a cut.
-    assert is_cut
-    assert records == read(CONTENT)[0][: len(records)]
+        assert is_cut
+        assert records == read(CONTENT)[0][: len(records)]
+    else:
+        assert said.startswith("a.journal: byte ")
 
 
 @given(st.binary(max_size=400))
 def test_any_bytes_are_a_clean_end_or_one_clear_error(content):
-    try:
-        read(content)
-    except JournalError as error:
-        assert "\n" not in str(error)
+    assert "\n" not in mistake(read, content)
 
 
 @given(st.binary(max_size=200), st.integers(0, 2**32 - 1))
 def test_blocks_whose_check_sum_is_right_are_no_more_trusted(content, size):
     compressed = zlib.compress(content)
     block = struct.pack("<4sIII", b"XGJ1", len(compressed), size, zlib.crc32(compressed)) + compressed
-    try:
-        records, _ = read(block)
-    except JournalError:
-        return
-    assert size == len(content)
-    assert sum(len(record) + 4 for record in records) == size
+    if not mistake(read, block):
+        assert size == len(content) == sum(len(record) + 4 for record in read(block)[0])
 
 
 def test_a_bomb_does_not_fill_the_memory():
@@ -142,10 +142,7 @@ def test_a_bomb_does_not_fill_the_memory():
 
 @given(st.binary(max_size=200))
 def test_any_record_is_a_step_or_one_clear_error(record):
-    try:
-        unpack_step(record, "a.journal: step 3")
-    except JournalError as error:
-        assert str(error).startswith("a.journal: step 3: ")
+    assert mistake(unpack_step, record, "a.journal: step 3").startswith("a.journal: step 3: ")
 
 
 @given(st.data())
@@ -155,11 +152,10 @@ def test_a_garbled_step_is_a_step_or_one_clear_error(data):
         record[data.draw(st.integers(0, len(record) - 1))] = data.draw(st.integers(0, 255))
     cut = data.draw(st.integers(0, len(record)))
     for content in (bytes(record), bytes(record[:cut])):
-        try:
-            found = unpack_step(content, "step")
-            plain(bytes(found.output))
-        except JournalError as error:
-            assert str(error).startswith(("step: ", "a packed value: "))
+        if said := mistake(unpack_step, content, "step"):
+            assert said.startswith("step: ")
+        else:
+            mistake(plain, bytes(unpack_step(content, "step").output))
 
 
 RECORDS = [pack_step(seq, *step) for seq, step in enumerate(steps(8))]
@@ -173,13 +169,3 @@ def test_a_nest_without_end_is_one_clear_error():
 def test_a_value_of_another_kind_is_named():
     with pytest.raises(JournalError, match=r"x\.journal: session: Expected `int`"):
         unpack_as(int, pack_value("seven"), "x.journal: session")
-
-
-def test_random_blocks_in_a_row_never_hang(tmp_path):
-    rng = random.Random(5)
-    for _ in range(200):
-        content = b"".join(rng.choice((CONTENT[:BLOCK_ENDS[1]], rng.randbytes(rng.randrange(40)))) for _ in range(4))
-        try:
-            read(content)
-        except JournalError:
-            continue

@@ -1,6 +1,7 @@
 """When the gateway steps."""
 
 import random
+from itertools import pairwise
 
 from gateway.pacing import DRIFT_NS, PULL_NS, SHIFT_NS, Pacer
 
@@ -30,7 +31,7 @@ def run(seconds, arrivals_ns, stall=(0, 0)):
 
 
 def gaps(steps):
-    return [after - before for before, after in zip(steps, steps[1:], strict=False)]
+    return [after - before for before, after in pairwise(steps)]
 
 
 def test_without_commands_the_grid_is_exact():

@@ -385,6 +385,19 @@ def test_the_first_frame_after_waking_must_be_safe():
     assert "reaction" in script.tick(2).rules
 
 
+def test_a_gateway_that_was_stopped_answers_with_its_first_frame():
+    script = Script().engage()
+    script.oracle.mark_fault(script.now_ns, "F6")
+    script.oracle.mark_gap(script.now_ns, script.now_ns + 510 * MS)
+    script.now_ns += 500 * MS
+    assert "reaction" not in script.go("Engage").tick(3).rules
+    late = Script().engage()
+    late.oracle.mark_fault(late.now_ns, "F6")
+    late.oracle.mark_gap(late.now_ns, late.now_ns + 510 * MS)
+    late.now_ns += 500 * MS
+    assert "reaction" in late.tick(2).rules
+
+
 def test_no_reaction_is_accepted_where_none_is_due_and_one_is_reported():
     assert reaction("F3", 10, lambda script: None).rules == set()
     assert "false reaction" in reaction("F3", 10, _stops).rules
@@ -393,7 +406,9 @@ def test_no_reaction_is_accepted_where_none_is_due_and_one_is_reported():
 
 @pytest.mark.parametrize("react", [_lets_go, _is_quiet])
 def test_silence_and_letting_go_are_both_reactions_to_a_dead_bus(react):
-    assert "reaction" not in reaction("F10", 5, react).rules
+    in_time = reaction("F10", 5, react)
+    assert "reaction" not in in_time.rules
+    assert [answer.latency_ns for answer in in_time.oracle.reactions] == [53 * MS]
     assert "reaction" in reaction("F10", 7, react).rules
 
 

@@ -38,6 +38,9 @@ _DEMAND_WINDOW_NS = 250 * MS  # panda's real-time window
 _SPEED_WINDOW_NS = 120 * MS  # age of a speed that the gateway may still rely on
 _STEER_LSB_DEG, _PEDAL_LSB_PERCENT = 0.05, 0.01
 _NEUTRAL_MODES = ("Off", "Standby")
+_SILENT_NS = 30 * MS
+_UNSAFE = {Kind.STOP: ("Engage",), Kind.RELEASE: ("Engage", "Stop"), Kind.SILENCE: ("Engage", "Stop")}
+"""What the gateway must no longer claim after a fault, by the reaction that is due."""
 
 
 class Violation(NamedTuple):
@@ -113,6 +116,8 @@ class BusOracle:
         self._speeds: deque[tuple[int, float]] = deque()
         self._question: tuple[int, int] | None = None
         self._older_questions: deque[tuple[int, int]] = deque(maxlen=8)
+        self._commanded_ns = 0
+        self._gap_until_ns = 0
         self._start()
 
     def _start(self) -> None:
@@ -130,9 +135,17 @@ class BusOracle:
     def mark_fault(self, t_ns: int, fault: str) -> None:
         """A fault of the table begins at `t_ns`."""
         reaction = REACTIONS[fault]
-        if self.authority == "Engage" or reaction.kind is Kind.SILENCE:
+        if self.authority == "Engage" or (self.authority == "Stop" and reaction.kind in (Kind.RELEASE, Kind.SILENCE)):
             within_ns = reaction.within_ns if self._is_virtual else reaction.within_process_ns or reaction.within_ns
-            self._pending.append(_Pending(fault, t_ns, reaction.kind, t_ns + within_ns + self._jitter_ns))
+            deadline_ns = max(t_ns + within_ns + self._jitter_ns, self._gap_until_ns)
+            self._pending.append(_Pending(fault, t_ns, reaction.kind, deadline_ns))
+
+    def mark_gap(self, t_ns: int, until_ns: int) -> None:
+        """The gateway's process is stopped from `t_ns` to `until_ns`: what is due in this time is due at its first frame after it."""
+        self._gap_until_ns = until_ns
+        for pending in self._pending:
+            if pending.deadline_ns > t_ns:
+                pending.deadline_ns = max(pending.deadline_ns, until_ns)
 
     def mark_end(self, fault: str) -> None:
         """A fault to which no reaction is due is over."""
@@ -391,28 +404,34 @@ class BusOracle:
     # ---- reactions
 
     def _settle(self, t_ns: int, authority: str) -> None:
-        """Judge the safety command against the faults that are open: it opens the frames of its tick."""
+        """Judge the safety command, which opens the frames of its tick, against the faults that are open."""
+        self._commanded_ns = t_ns
         still: list[_Pending] = []
         for pending in self._pending:
-            is_answered = t_ns >= pending.marked_ns and (
-                (pending.kind is Kind.STOP and authority != "Engage")
-                or (pending.kind in (Kind.RELEASE, Kind.SILENCE) and authority not in ("Engage", "Stop"))
-            )
-            if pending.kind is Kind.NONE and authority != "Engage":
-                self._violate(t_ns, "false reaction", f"{pending.fault}: {authority} after {(t_ns - pending.marked_ns) / MS:.1f} ms")
-            elif is_answered:
-                self.reactions.append(Answer(pending.fault, t_ns - pending.marked_ns))
-            elif pending.kind is Kind.SILENCE and t_ns > pending.deadline_ns:
-                self._violate(t_ns, "reaction", f"{pending.fault}: still sends {authority} after {(t_ns - pending.marked_ns) / MS:.1f} ms")
+            latency_ns = t_ns - pending.marked_ns
+            is_safe = latency_ns >= 0 and authority not in _UNSAFE.get(pending.kind, ())
+            if pending.kind is Kind.NONE:
+                if authority != "Engage":
+                    self._violate(t_ns, "false reaction", f"{pending.fault}: {authority} after {latency_ns / MS:.1f} ms")
+                else:
+                    still.append(pending)
+            elif t_ns > pending.deadline_ns:
+                what = f"first safe frame only after {latency_ns / MS:.1f} ms" if is_safe else f"{authority} after {latency_ns / MS:.1f} ms"
+                self._violate(t_ns, "reaction", f"{pending.fault}: {what}, allowed {(pending.deadline_ns - pending.marked_ns) / MS:.0f} ms")
+            elif is_safe:
+                self.reactions.append(Answer(pending.fault, latency_ns))
             else:
                 still.append(pending)
         self._pending = still
 
     def _expire(self, t_ns: int) -> None:
-        """Faults whose time is over without a safe frame; silence is a reaction where it is asked for."""
-        if not self._pending:
+        """A gateway that has fallen silent has let go: the robots' own timeout stops the car."""
+        if not self._pending or t_ns - self._commanded_ns <= _SILENT_NS:
             return
+        still: list[_Pending] = []
         for pending in self._pending:
-            if pending.kind in (Kind.STOP, Kind.RELEASE) and t_ns > pending.deadline_ns:
-                self._violate(t_ns, "reaction", f"{pending.fault}: no safe frame within {(pending.deadline_ns - pending.marked_ns) / MS:.0f} ms")
-        self._pending = [p for p in self._pending if not (p.kind in (Kind.STOP, Kind.RELEASE) and t_ns > p.deadline_ns)]
+            if pending.kind in _UNSAFE and t_ns > pending.deadline_ns:
+                self.reactions.append(Answer(pending.fault, max(0, self._commanded_ns + _TICK_NS - pending.marked_ns)))
+            else:
+                still.append(pending)
+        self._pending = still

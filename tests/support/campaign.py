@@ -17,6 +17,7 @@ from gateway.core import GatewayCore, StepOutput
 from gateway.limits import PROFILES
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, Mode, Operation, OperatorReply, OperatorRequest
 from tests.support.bus_oracle import BusOracle
+from tests.support.oracle_limits import REACTIONS
 from tests.support.robots import StubCar
 
 MS = 1_000_000
@@ -89,6 +90,8 @@ class World:
         commands: on their way to the gateway, by time of arrival.
         gap_until_ns: until then the gateway does not run.
         is_deaf: whether the car hears nothing of the gateway.
+        watches: called after every tick until they answer True.
+        least_severity: of the reactions that are awaited; of two faults only the severer has to be answered.
         replies: of the gateway to the operator.
     """
 
@@ -111,6 +114,8 @@ class World:
         self.replies: list[OperatorReply] = []
         self.gap_until_ns = 0
         self.is_deaf = False
+        self.watches: list[Callable[[World], bool]] = []
+        self.least_severity = 0
         self.output: StepOutput | None = None
         self.sent: list[CanFrame] = []
         self._on_the_way: Frames = []
@@ -138,6 +143,21 @@ class World:
     def mode(self) -> Mode:
         """Mode of the gateway."""
         return self.core.mode
+
+    def mark(self, t_ns: int, fault: str) -> None:
+        """A fault of the oracle's table begins; while the gateway sleeps it is due when it wakes."""
+        if REACTIONS[fault].kind.severity >= self.least_severity:
+            self.oracle.mark_fault(t_ns, fault)
+
+    def mark_end(self, fault: str) -> None:
+        """A fault to which no reaction is due is over."""
+        self.oracle.mark_end(fault)
+
+    def sleep(self, duration_ns: int) -> None:
+        """The gateway's process does not run, from now on."""
+        self.gap_until_ns = self.now_ns + duration_ns
+        self.gap_until_ns -= (self.gap_until_ns - self.now_ns) % TICK_NS
+        self.oracle.mark_gap(self.now_ns, self.gap_until_ns)
 
     def ask(self, operation: Operation) -> None:
         """The operator asks for something; it is heard in the next tick."""
@@ -182,6 +202,8 @@ class World:
             self.oracle.observe(self.now_ns, "robots", frame.arbitration_id, frame.data, is_from_gateway=True)
         if not self.is_deaf:
             self.car.hear(self.sent)
+        if self.watches:
+            self.watches = [watch for watch in self.watches if not watch(self)]
 
     def _speak(self, since_ns: int) -> None:
         """The frames of one cycle of the car go onto the buses, each at its phase, and through what disturbs them."""

@@ -143,5 +143,6 @@ REACTIONS = {
     "F14": Reaction(Kind.NONE, 0, "B3 F14: no effect"),
     "F15": Reaction(Kind.NONE, 0, "B3 F15: control unchanged"),
     "F17": Reaction(Kind.STOP, 150 * MS, "B3 F17: as F1"),
+    "second sender": Reaction(Kind.SILENCE, 10 * MS, "issue, Gate: a second sender of our own identifiers is detected; in the tick of its frame"),
     "E3": Reaction(Kind.RELEASE, 10 * MS, "B3 E3: the driver ends ENGAGED in the same tick", 50 * MS),
 }

@@ -111,18 +111,28 @@ class WireMessage:
 
     def compose(self, values: dict[str, float | str], counter: int = 0) -> bytes:
         """Payload with these physical values, or names of enumerated ones, all else zero; protected where the DBC asks for it."""
-        data = bytearray(self.length)
+        return self.sealed(self.changed(bytes(self.length), values), counter)
+
+    def changed(self, data: bytes, values: dict[str, float | str]) -> bytes:
+        """The payload with these values, and protection that no longer fits."""
+        content = bytearray(data)
         for signal, value in values.items():
             field = self.fields[signal]
             if isinstance(value, str):
                 value = next(raw for raw, name in self.choices[signal].items() if name == value)
             raw = round((value - field.offset) / field.scale)
             for k, (byte, bit) in enumerate(reversed(field.bits)):
-                data[byte] |= (raw >> k & 1) << bit
-        if self.data_id is not None:
-            data[1] = data[1] & 0xF0 | counter % 16
-            data[0] = profile2_crc(bytes(data), self.data_id)
-        return bytes(data)
+                content[byte] = content[byte] & ~(1 << bit) | (raw >> k & 1) << bit
+        return bytes(content)
+
+    def sealed(self, data: bytes, counter: int) -> bytes:
+        """The payload with this counter and the CRC that fits; as it is where the message is not protected."""
+        if self.data_id is None:
+            return data
+        content = bytearray(data)
+        content[1] = content[1] & 0xF0 | counter % 16
+        content[0] = profile2_crc(bytes(content), self.data_id)
+        return bytes(content)
 
     def value(self, data: bytes, signal: str) -> float:
         """Physical value of a signal."""

@@ -22,6 +22,7 @@ NAMES = [
     "interface can1",
     "real-time priority",
     "memory locking",
+    "processor for control",
     "real-time kernel",
     "browser",
 ]
@@ -96,10 +97,30 @@ def test_realtime_priority_refused(monkeypatch):
     def refuse(*_):
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr("xil.doctor.os.sched_setscheduler", refuse)
+    monkeypatch.setattr("dbc.realtime.os.sched_setscheduler", refuse)
     check = named("real-time priority")
     assert not check.is_ok
-    assert check.found.startswith("SCHED_FIFO refused, rtprio limit ")
+    assert check.found.startswith("SCHED_FIFO 60 refused, rtprio limit ")
+    assert "LimitRTPRIO=60" in check.advice
+
+
+def test_realtime_priority_is_that_of_the_gateway(monkeypatch):
+    asked = []
+    monkeypatch.setattr("dbc.realtime.os.sched_setscheduler", lambda _, __, parameter: asked.append(parameter.sched_priority))
+    assert named("real-time priority").is_ok
+    assert asked == [60]  # a limit below it would let a test with the lowest priority pass
+
+
+@pytest.mark.parametrize(
+    ("text", "finding"), [("1-3\n", (True, "isolated: 1-3")), ("\n", (False, "none isolated")), (None, (False, "none isolated"))]
+)
+def test_processor_for_control(monkeypatch, tmp_path, text, finding):
+    path = tmp_path / "isolated"
+    monkeypatch.setattr("xil.doctor._SYS_ISOLATED", path)
+    if text is not None:
+        path.write_text(text, encoding="ascii")
+    check = named("processor for control")
+    assert (check.is_ok, check.found) == finding
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,147 @@
+"""Judgement on frames, and on those that are missing."""
+
+import pytest
+
+from dbc.catalogue import load
+from dbc.e2e import E2EProtector
+from dbc.frame import CanFrame
+from gateway.causes import Cause, Finding
+from gateway.supervision import MAX_BAD_FRAMES, RECOVERY_NS, WINDOW_FRAMES, Supervisor
+
+CATALOGUE = load()
+MS = 1_000_000
+STATUS = CATALOGUE.by_name["SR_Status"]
+POSITION = CATALOGUE.by_name["PosLocal"]
+
+
+class Sender:
+    """Sends good frames of a message, or spoilt ones."""
+
+    def __init__(self, name="SR_Status", **values):
+        self.spec = CATALOGUE.by_name[name]
+        self._payload = CATALOGUE.encode(name, values)
+        self._protector = None if self.spec.e2e_data_id is None else E2EProtector(self.spec.e2e_data_id)
+
+    def frame(self, t_ns):
+        payload = self._payload if self._protector is None else self._protector.protect(self._payload)
+        return CanFrame(self.spec.arbitration_id, payload, t_ns)
+
+    def bad(self, t_ns):
+        good = self.frame(t_ns)
+        return good._replace(data=bytes([good.data[0] ^ 0xFF]) + good.data[1:])
+
+
+def supervisor():
+    return Supervisor(CATALOGUE, ["SR_Status", "PosLocal"])
+
+
+def causes(findings):
+    return {(finding.cause, finding.source) for finding in findings}
+
+
+def test_good_frames_are_decoded_the_newest_wins():
+    watching, sender = supervisor(), Sender(AngleActual=12.5)
+    newer = Sender(AngleActual=13.0)
+    newer.frame(0)
+    values = watching.observe([sender.frame(5), newer.frame(6), Sender("PosLocal", PosLocalX=3.0).frame(7)])
+    assert values["SR_Status"]["AngleActual"] == 13.0
+    assert values["PosLocal"]["PosLocalX"] == 3.0
+    assert (watching.arrival_ns("SR_Status"), watching.arrival_ns("PosLocal")) == (6, 7)
+    assert (watching.received, watching.rejected) == (3, {})
+    assert watching.findings(8) == []
+
+
+def test_nothing_has_arrived_yet():
+    watching = supervisor()
+    assert watching.arrival_ns("SR_Status") is None
+    missing = Finding(Cause.MESSAGE_MISSING, (STATUS.timeout_ns + 1) * 1e-6, STATUS.timeout_ns * 1e-6, "SR_Status")
+    assert missing in watching.findings(0)
+    assert causes(watching.findings(0)) == {(Cause.MESSAGE_MISSING, "SR_Status"), (Cause.MESSAGE_MISSING, "PosLocal")}
+
+
+@pytest.mark.req("F6")
+def test_a_message_is_missing_from_its_timeout_on():
+    watching = supervisor()
+    watching.observe([Sender().frame(10), Sender("PosLocal").frame(10 + MS)])
+    assert watching.findings(10 + STATUS.timeout_ns) == []
+    late_ns = 10 + STATUS.timeout_ns + 1
+    assert watching.findings(late_ns) == [
+        Finding(Cause.MESSAGE_MISSING, (STATUS.timeout_ns + 1) * 1e-6, STATUS.timeout_ns * 1e-6, "SR_Status")
+    ]
+
+
+@pytest.mark.req("F7")
+@pytest.mark.parametrize("data", [b"", bytes(7), bytes(9), bytes(64)])
+def test_another_length_is_no_frame(data):
+    watching = supervisor()
+    assert watching.observe([CanFrame(STATUS.arbitration_id, data, 0)]) == {}
+    assert watching.rejected == {"SR_Status: length": 1}
+    assert watching.arrival_ns("SR_Status") is None
+
+
+@pytest.mark.req("F7")
+def test_wrong_crc_and_repeated_counter_are_ignored_at_once():
+    watching, sender = supervisor(), Sender(AngleActual=1.0)
+    good = sender.frame(0)
+    assert "SR_Status" in watching.observe([good])
+    assert watching.observe([good._replace(t_ns=1), sender.bad(2)]) == {}
+    assert watching.rejected == {"SR_Status: repeated": 1, "SR_Status: wrong crc": 1}
+    assert watching.arrival_ns("SR_Status") == 0
+
+
+def test_a_value_out_of_its_range_is_ignored():
+    watching = supervisor()
+    angle_raw = (32767).to_bytes(2, "little")
+    payload = E2EProtector(STATUS.e2e_data_id).protect(bytes(2) + angle_raw + bytes(4))
+    assert watching.observe([CanFrame(STATUS.arbitration_id, payload, 3)]) == {}
+    assert watching.rejected == {"SR_Status: range": 1}
+    assert watching.arrival_ns("SR_Status") is None
+
+
+@pytest.mark.req("F7")
+def test_three_bad_frames_of_ten_make_a_message_invalid_until_a_second_is_clean():
+    watching, sender = supervisor(), Sender()
+    position = Sender("PosLocal")
+
+    def observe(k, is_bad):
+        t_ns = k * 10 * MS
+        watching.observe([sender.bad(t_ns) if is_bad else sender.frame(t_ns), position.frame(t_ns)])
+        return watching.findings(t_ns)
+
+    for k, is_bad in enumerate([False, True, False, True, False]):
+        assert observe(k, is_bad) == []
+    assert observe(5, True) == [Finding(Cause.MESSAGE_INVALID, MAX_BAD_FRAMES + 1, MAX_BAD_FRAMES, "SR_Status")]
+    for k in range(6, 106):
+        assert causes(observe(k, False)) == {(Cause.MESSAGE_INVALID, "SR_Status")}
+    assert (105 - 5) * 10 * MS == RECOVERY_NS
+    assert observe(106, False) == []
+    assert observe(107, False) == []
+    assert observe(108, True) == []  # and a single bad one is only counted again
+
+
+def test_bad_frames_that_lie_far_apart_are_only_counted():
+    watching, sender, position = supervisor(), Sender(), Sender("PosLocal")
+    for k in range(100):
+        t_ns = k * 10 * MS
+        is_bad = k % (WINDOW_FRAMES // 2) == 4
+        watching.observe([sender.bad(t_ns) if is_bad else sender.frame(t_ns), position.frame(t_ns)])
+        assert watching.findings(t_ns) == []
+    assert watching.rejected == {"SR_Status: wrong crc": 20}
+
+
+@pytest.mark.req("F11")
+def test_unknown_ids_are_counted_and_known_ones_that_nobody_needs_are_not():
+    watching = supervisor()
+    watching.observe([CanFrame(0x7FF, b"", 0), Sender("AR_Status").frame(0)])
+    assert watching.rejected == {"unknown id": 1}
+    assert watching.received == 2
+
+
+@pytest.mark.req("F5")
+def test_a_second_sender_of_our_frames_is_named_once():
+    watching = supervisor()
+    watching.observe([Sender().frame(0), Sender("PosLocal").frame(0), Sender("SR_Command").frame(0), Sender("SR_Command").frame(0)])
+    watching.observe([])
+    assert watching.findings(0) == [Finding(Cause.SECOND_SENDER, 2, 0, "SR_Command")]
+    assert watching.findings(0) == []
+    assert watching.rejected == {"SR_Command: second sender": 2}
