@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 
-.PHONY: setup run test test-socketcan lint bench clean lock
+.PHONY: setup run test test-socketcan lint bench clean lock install-target
 
 setup: $(VENV)/project.stamp
 	@set -- $$CC; for compiler in $$1 cc gcc clang; do \
@@ -31,6 +31,29 @@ lint: setup $(VENV)/dev.stamp
 bench: setup
 	$(BIN)/xilgate bench solver
 	$(BIN)/xilgate bench gateway
+
+# The gateway as a daemon of a target: docs/target.md. DESTDIR=DIRECTORY puts everything below a directory, for a package or an image.
+PREFIX := /opt/xilgate
+TARGET := $(DESTDIR)$(PREFIX)
+SYSTEM := $(DESTDIR)/usr/local/lib
+TARGET_PIP := $(TARGET)/bin/python -m pip --disable-pip-version-check --quiet
+install-target:
+	python3 -m venv $(TARGET)
+	$(TARGET_PIP) install --require-hashes --only-binary :all: -r requirements.lock
+	$(TARGET_PIP) install --no-deps --no-build-isolation --no-index --force-reinstall .
+	@# What pip wrote names the place that it was put together in.
+	sed -i '1s|^#!$(TARGET)/|#!$(PREFIX)/|' $$(grep -lI '^#!$(TARGET)/' $(TARGET)/bin/*)
+	install -D -m 644 docs/target.md -t $(TARGET)/share/doc
+	install -D -m 644 gateway/target/xilgate-gateway.service -t $(SYSTEM)/systemd/system
+	install -D -m 644 gateway/target/80-xilgate-can0.network -t $(SYSTEM)/systemd/network
+	install -D -m 644 gateway/target/80-xilgate-can.rules -t $(SYSTEM)/udev/rules.d
+	install -D -m 644 gateway/target/xilgate.sysusers.conf $(SYSTEM)/sysusers.d/xilgate.conf
+	install -D -m 644 gateway/target/xilgate.tmpfiles.conf $(SYSTEM)/tmpfiles.d/xilgate.conf
+	install -d -m 750 $(DESTDIR)/etc/xilgate
+	@for file in gateway/target/rig.toml dbc/robots.dbc dbc/gnss_imu.dbc dbc/focus.toml; do \
+	    test -e $(DESTDIR)/etc/xilgate/$${file##*/} || install -m 644 $$file -t $(DESTDIR)/etc/xilgate || exit 1; \
+	done
+	@echo "installed in $(TARGET); what is left to do: $(PREFIX)/share/doc/target.md"
 
 clean:
 	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from controller.inbox import ObjectInbox
-from controller.journal import RecordedNmpc
+from controller.journal import ControllerSession, RecordedNmpc
 from controller.nmpc import DRIVE_MODEL, Nmpc, NmpcOptions
 from controller.objects import nearest
 from controller.parameters import ParameterStore
 from controller.planning.reference import ReferencePath
 from controller.problem import OcpOptions
-from controller.record import controller_session, record_in
+from controller.record import controller_session, fingerprint, record_in
 from controller.samples import Circumstances, ProfileMeter, command_sample, parameters_sample, plan_sample
 from controller.solver import Solver
 from controller.solvers import DEFAULT_SOLVER, make_solver
@@ -26,7 +26,7 @@ from dbc.vehicle import Vehicle, load_vehicle
 from gateway.channel import Channel, ControlPath
 from gateway.loop import PeriodicLoop
 from gateway.messages import PLAN_PERIOD_NS, CommandStatus, Mode, VehicleState
-from gateway.telemetry import DEFAULT_BASE_PORT, Publisher, Source, new_boot_id
+from gateway.telemetry import DEFAULT_BASE_PORT, Publisher, Source, TlsSection, new_boot_id
 
 log = logging.getLogger("xilgate.controller")
 
@@ -44,6 +44,7 @@ class ControllerOptions:
         control: where the gateway is found.
         solver: name in `solvers.SOLVERS`.
         journal: directory of the journal, None for none.
+        tls: telemetry for other machines, None for loopback alone.
     """
 
     reference_csv: Path
@@ -52,6 +53,7 @@ class ControllerOptions:
     solver: str = DEFAULT_SOLVER
     telemetry_base_port: int = DEFAULT_BASE_PORT
     journal: Path | None = None
+    tls: TlsSection | None = None
 
 
 def run(options: ControllerOptions, stop: threading.Event) -> None:
@@ -68,14 +70,15 @@ def run(options: ControllerOptions, stop: threading.Event) -> None:
     solver = make_solver(options.solver, vehicle.model, ocp, log.info)
     warm_up(solver, path, vehicle)
     store = ParameterStore(ocp, numbers.planner)
+    session = controller_session(new_boot_id(), options.solver, numbers.deadline_ns, options.reference_csv, options.vehicle_path)
     with (
-        Publisher(Source.CONTROLLER, options.telemetry_base_port) as telemetry,
+        Publisher(Source.CONTROLLER, options.telemetry_base_port, options.tls) as telemetry,
         ObjectInbox(options.telemetry_base_port) as inbox,
         Channel(options.control.controller_socket, options.control.gateway_socket, key) as channel,
-        _nmpc(options, solver, path, vehicle, numbers) as nmpc,
+        _nmpc(options.journal, session, (solver, path, vehicle, session.boot_id, numbers)) as nmpc,
     ):
         telemetry.serve(SERVICE, TuningService(store).answer)
-        cycle = ControlCycle(nmpc, solver.name, channel, telemetry, store=store, inbox=inbox)
+        cycle = ControlCycle(nmpc, solver.name, channel, telemetry, store=store, inbox=inbox, sha256=fingerprint(session))
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
         become_realtime(CONTROLLER_PRIORITY)
         loop = PeriodicLoop(PLAN_PERIOD_NS)
@@ -84,27 +87,36 @@ def run(options: ControllerOptions, stop: threading.Event) -> None:
 
 
 @contextlib.contextmanager
-def _nmpc(options: ControllerOptions, solver: Solver, path: ReferencePath, vehicle: Vehicle, numbers: NmpcOptions) -> Iterator[Nmpc]:
+def _nmpc(
+    journal: Path | None, session: ControllerSession, parts: tuple[Solver, ReferencePath, Vehicle, int, NmpcOptions]
+) -> Iterator[Nmpc]:
     """The controller, recorded where that is asked for."""
-    boot_id = new_boot_id()
-    if options.journal is None:
-        yield Nmpc(solver, path, vehicle, boot_id, numbers)
+    if journal is None:
+        yield Nmpc(*parts)
         return
-    session = controller_session(boot_id, options.solver, numbers.deadline_ns, options.reference_csv, options.vehicle_path)
-    with record_in(options.journal, session) as keep:
-        yield RecordedNmpc(solver, path, vehicle, boot_id, numbers, keep=keep)
+    with record_in(journal, session) as keep:
+        yield RecordedNmpc(*parts, keep=keep)
 
 
 class ControlCycle:
     """What happens 25 times a second. Whatever comes from other threads is taken at the edge, as one reference each."""
 
     def __init__(
-        self, nmpc: Nmpc, solver_name: str, channel: Channel, telemetry: Publisher, *, store: ParameterStore, inbox: ObjectInbox
+        self,
+        nmpc: Nmpc,
+        solver_name: str,
+        channel: Channel,
+        telemetry: Publisher,
+        *,
+        store: ParameterStore,
+        inbox: ObjectInbox,
+        sha256: str = "",
     ) -> None:
         self._nmpc = nmpc
         self._solver_name = solver_name
         self._store = store
         self._inbox = inbox
+        self._sha256 = sha256
         self._channel = channel
         self._telemetry = telemetry
         self._profile = ProfileMeter(solver_name)
@@ -120,7 +132,7 @@ class ControlCycle:
         objects = nearest(self._inbox.report, now_ns, state.x_m, state.y_m)
         output = self._nmpc.step(state, now_ns, objects)
         self._channel.send(output.command)
-        made_with = Circumstances(self._store.in_force, len(objects), self._inbox.rejected)
+        made_with = Circumstances(self._store.in_force, len(objects), self._inbox.rejected, self._sha256)
         self._telemetry.post(command_sample(output, self._solver_name, time.monotonic_ns() - now_ns, made_with))
         for sample in (plan_sample(output), self._profile.add(output, now_ns)):
             if sample is not None:

@@ -1,6 +1,7 @@
 """The record of a controller: its session, and the journal that a thread of its own brings to the disk."""
 
 import contextlib
+import hashlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -31,6 +32,12 @@ def controller_session(boot_id: int, solver: str, deadline_ns: int | None, refer
     return ControllerSession(
         **origin(boot_id, decided_by), solver=solver, deadline_ns=deadline_ns, reference=reference, vehicle=vehicle
     )
+
+
+def fingerprint(session: ControllerSession) -> str:
+    """One SHA-256 of all that a controller decides with."""
+    lines = (f"{name} {digest}\n" for name, digest in sorted(session.sha256.items()))
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 @contextlib.contextmanager

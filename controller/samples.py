@@ -22,11 +22,13 @@ class Circumstances:
         parameters_version: of the parameters in force.
         objects: how many objects the planner was given.
         objects_rejected: things on the topic of the objects that were none, since the start.
+        controller_sha256: of all that the controller decides with.
     """
 
     parameters_version: int = 0
     objects: int = 0
     objects_rejected: int = 0
+    controller_sha256: str = ""
 
 
 def command_sample(output: NmpcOutput, solver_name: str, step_time_ns: int, made_with: Circumstances = Circumstances()) -> CommandSample:
@@ -56,6 +58,7 @@ def command_sample(output: NmpcOutput, solver_name: str, step_time_ns: int, made
         parameters_version=made_with.parameters_version,
         objects=made_with.objects,
         objects_rejected=made_with.objects_rejected,
+        controller_sha256=made_with.controller_sha256,
     )
 
 

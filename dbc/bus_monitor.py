@@ -40,14 +40,14 @@ class BusMonitor:
         self.overflows += report.is_overflow
         if report.tx_error_count >= 0:
             self._tx_error_count, self._rx_error_count = report.tx_error_count, report.rx_error_count
-        # Counters do not lead out of bus-off: they may be those of the last attempt.
-        is_named = classes & (error_frames.BUS_OFF | error_frames.RESTARTED | error_frames.CONTROLLER)
-        if report.state is not None and (is_named or self.state is not BusState.BUS_OFF):
+        # Out of bus-off leads a restart alone: the kernel's slcan driver, for one, tells of an active controller and still sends nothing.
+        if report.state is not None and (self.state is not BusState.BUS_OFF or classes & error_frames.RESTARTED):
             self._enter(report.state, now_ns)
 
     def told(self, state: BusState, tx_error_count: int, rx_error_count: int, now_ns: int) -> None:
         """The driver has told its state now; counters -1 where it has none."""
-        self._tx_error_count, self._rx_error_count = tx_error_count, rx_error_count
+        if tx_error_count >= 0:
+            self._tx_error_count, self._rx_error_count = tx_error_count, rx_error_count
         self._enter(state, now_ns)
 
     def refused(self, error_number: int, now_ns: int) -> None:

@@ -277,7 +277,8 @@ class PythonCanPort:
         return True
 
     def close(self) -> None:  # noqa: D102
-        self._bus.shutdown()
+        with contextlib.suppress(*_REFUSALS):
+            self._bus.shutdown()
 
     def _identifier(self, message: can.Message) -> int:
         if message.is_error_frame:

@@ -144,6 +144,11 @@ class CanLink:
         return self._lost + self._monitor.overflows
 
     @property
+    def bus_errors(self) -> int:
+        """Reports of the controller's that a frame was destroyed on the wire or that nobody acknowledged it."""
+        return self._monitor.bus_errors
+
+    @property
     def refusal(self) -> str:
         """Why the last attempt to leave bus-off was refused; empty when none was."""
         return self._port.refusal

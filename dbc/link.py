@@ -119,6 +119,11 @@ class BusSet:
         return [network for network, health in self.health().items() if health.state in SILENT_STATES]
 
     @property
+    def bus_errors(self) -> dict[str, int]:
+        """Reports that a frame was destroyed on the wire or that nobody acknowledged it, by network."""
+        return {network: link.bus_errors for network, link in self._by_network.items()}
+
+    @property
     def refusals(self) -> dict[str, str]:
         """Why the last attempt to leave bus-off was refused, by network; for the log."""
         return {network: link.refusal for network, link in self._by_network.items() if link.refusal}

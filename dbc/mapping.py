@@ -111,6 +111,7 @@ def _renamed(message: Message, mapping: SiteMapping, reference: Mapping[str, Mes
             renamed.multiplexer_signal = our_signals.get(signal.multiplexer_signal, signal.multiplexer_signal)
         if known := _find(reference, name, renamed.name):
             renamed.unit = known.unit
+            renamed.raw_initial = _start(renamed, known)
         signals.append(renamed)
     return Message(
         frame_id=message.frame_id,
@@ -138,6 +139,13 @@ def _converted(signal: Signal, at_site: SignalMapping) -> Signal:
     converted.conversion = BaseConversion.factory(scale, shift, choices or None, signal.is_float)
     converted.minimum, converted.maximum = ends if factor > 0.0 else reversed(ends)
     return converted
+
+
+def _start(signal: Signal, ours: Signal) -> int | float | None:
+    """What a table signal is when nobody gives it: the entry that is 0 in our DBC, whatever number the site gives to it."""
+    neutral = [str(entry) for raw, entry in (ours.choices or {}).items() if raw == 0]
+    found = [raw for raw, entry in (signal.choices or {}).items() if str(entry) in neutral]
+    return found[0] if found else signal.raw_initial
 
 
 def _find(messages: Mapping[str, Message], message: str, signal: str) -> Signal | None:

@@ -93,7 +93,7 @@ class Field(NamedTuple):
     Args:
         minimum, maximum: smallest and largest value of the DBC that the bits can hold.
         low, high: these, wider by what rounding takes back: factors are decimal, floats are not.
-        neutral: zero, or the nearest value that the signal can take: a database need not give start values.
+        neutral: the start value of the DBC (`GenSigStartValue`); without one zero, or the nearest value that the signal can take.
         sign: value of the sign bit; 0 for a signal without.
     """
 
@@ -116,7 +116,8 @@ class Field(NamedTuple):
         minimum = minimum if signal.minimum is None else max(minimum, signal.minimum)
         maximum = maximum if signal.maximum is None else min(maximum, signal.maximum)
         slack = 0.0 if signal.is_float else 0.499 * abs(signal.scale)
-        neutral = min(max(0.0, minimum), maximum)
+        start = None if signal.raw_initial is None else signal.raw_initial * signal.scale + signal.offset
+        neutral = min(max(0.0, minimum), maximum) if start is None else start
         low, high = minimum - slack, maximum + slack
         return cls(signal.name, minimum, maximum, low, high, neutral, mask, sign, signal.scale, signal.offset)
 

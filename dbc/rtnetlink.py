@@ -17,7 +17,7 @@ from dbc.health import BusState
 _ERROR, _NEW_LINK, _DELETE_LINK, _GET_LINK = 2, 16, 17, 18
 _REQUEST, _ACKNOWLEDGE = 0x1, 0x4
 _GROUP_OF_LINKS = 1
-_IFF_UP = 0x1
+_IFF_UP, _IFF_LOWER_UP = 0x1, 0x1_0000
 # Attributes: of a link, of its kind, of a CAN interface.
 _LINK_INFO, _KIND, _DATA = 18, 1, 2
 _CAN_STATE, _CAN_RESTART, _CAN_ERROR_COUNTERS = 4, 7, 8
@@ -109,7 +109,7 @@ class LinkWatch:
             for kind, body in _messages(datagram):
                 if kind == _ERROR:
                     self._take_answer(body)
-                elif (controller := _controller(kind, body, self._index)) is not None:
+                elif (controller := read_message(kind, body, self._index)) is not None:
                     newest = controller
                     has_changed |= groups != 0
         return has_changed, newest
@@ -155,7 +155,7 @@ def _attributes(data: bytes) -> dict[int, bytes]:
     return found
 
 
-def _controller(kind: int, body: bytes, index: int) -> Controller | None:
+def read_message(kind: int, body: bytes, index: int) -> Controller | None:
     """What a message says of an interface; None when it is about something else."""
     if kind not in {_NEW_LINK, _DELETE_LINK} or len(body) < _INTERFACE.size:
         return None
@@ -169,8 +169,9 @@ def _controller(kind: int, body: bytes, index: int) -> Controller | None:
     tx = rx = -1
     if len(counters := told.get(_CAN_ERROR_COUNTERS, b"")) == _COUNTERS.size:
         tx, rx = _COUNTERS.unpack(counters)
-    state = BusState.ERROR_ACTIVE
-    if len(value := told.get(_CAN_STATE, b"")) == _WORD.size:
+    # The kernel takes the carrier off at bus-off and gives it back at a restart.
+    state = BusState.ERROR_ACTIVE if flags & _IFF_LOWER_UP else BusState.BUS_OFF
+    if state is not BusState.BUS_OFF and len(value := told.get(_CAN_STATE, b"")) == _WORD.size:
         (number,) = _WORD.unpack(value)
         state = _STATE_OF_CAN_STATE[number] if 0 <= number < len(_STATE_OF_CAN_STATE) else BusState.DOWN
     return Controller(state, tx, rx)

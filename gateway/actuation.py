@@ -190,18 +190,19 @@ class Actuation:
         self._note(ACCELERATION, asked_mps2, top_mps2, driven_mps2)
         target_mps2 = max(driven_mps2, bottom_mps2)
         self._note(DECELERATION, driven_mps2, bottom_mps2, target_mps2)
-        high_mps2 = before_mps2 + profile.drive_jerk_mps3 * self._tick_s
-        low_mps2 = min(before_mps2, 0.0) - profile.brake_jerk_mps3 * self._tick_s
-        for name, limit_mps3, reached_mps2 in (
-            (DRIVE_JERK, profile.drive_jerk_mps3, min(target_mps2, high_mps2)),
-            (BRAKE_JERK, -profile.brake_jerk_mps3, max(target_mps2, low_mps2)),
+        if brake_norm >= BRAKE_RELEASED_NORM:
+            target_mps2 = min(target_mps2, 0.0)  # interlock: the accelerator waits until the brake pedal has really come back
+        drive_mps2, brake_mps2 = profile.drive_jerk_mps3 * self._tick_s, profile.brake_jerk_mps3 * self._tick_s
+        low_mps2 = min(before_mps2, 0.0) - brake_mps2
+        high_mps2 = min(before_mps2 + brake_mps2, 0.0) if before_mps2 < 0.0 else before_mps2 + drive_mps2
+        for name, bound_mps2, reached_mps2 in (
+            (DRIVE_JERK, high_mps2, min(target_mps2, high_mps2)),
+            (BRAKE_JERK, low_mps2, max(target_mps2, low_mps2)),
         ):
-            self._note(name, (target_mps2 - before_mps2) / self._tick_s, limit_mps3, (reached_mps2 - before_mps2) / self._tick_s)
+            self._note(name, *((value_mps2 - before_mps2) / self._tick_s for value_mps2 in (target_mps2, bound_mps2, reached_mps2)))
         if bottom_mps2 + self._brake_step_mps2 <= high_mps2:
             low_mps2, high_mps2 = max(low_mps2, bottom_mps2), min(high_mps2, top_mps2)
-        accelerator_norm, limited_brake_norm = self._split(clamp(target_mps2, low_mps2, high_mps2), low_mps2, high_mps2)
-        # Interlock: the accelerator waits until the brake pedal has really come back.
-        return accelerator_norm if brake_norm < BRAKE_RELEASED_NORM else 0.0, limited_brake_norm
+        return self._split(clamp(target_mps2, low_mps2, high_mps2), low_mps2, high_mps2)
 
     def _split(self, acceleration_mps2: float, low_mps2: float, high_mps2: float) -> tuple[float, float]:
         """Accelerator or brake for an acceleration, on steps of the bus within [low, high]."""

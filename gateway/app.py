@@ -38,18 +38,16 @@ def run(
     key = control.key()
     warm_up(preparation)
     with contextlib.ExitStack() as opened:
-        links = Links(
-            buses=opened.enter_context(BusSet(rig.buses.by_network, preparation.catalogue, OWN_NODE)),
-            channel=opened.enter_context(Channel(control.gateway_socket, control.controller_socket, key)),
-            operators=opened.enter_context(OperatorServer(control.operator_socket, key)),
-            telemetry=opened.enter_context(Publisher(Source.GATEWAY, rig.telemetry.base_port)),
-            recorder=opened.enter_context(start_recorder(preparation, rig.recorder, boot_id)) if rig.recorder is not None else None,
-        )
+        recorder = opened.enter_context(start_recorder(preparation, rig.recorder, boot_id)) if rig.recorder is not None else None
+        telemetry = opened.enter_context(Publisher(Source.GATEWAY, rig.telemetry.base_port, rig.telemetry.tls))
+        operators = opened.enter_context(OperatorServer(control.operator_socket, key))
+        channel = opened.enter_context(Channel(control.gateway_socket, control.controller_socket, key))
+        buses = opened.enter_context(BusSet(rig.buses.by_network, preparation.catalogue, OWN_NODE))
         if rig.metrics is not None:
             opened.enter_context(MetricsServer(rig.metrics.port, pulse, logs))
         opened.enter_context(Housekeeper(pulse, orders, notifier, rig.daemon.watchdog_s, prepare))
         pulse.realtime = opened.enter_context(realtime_practice(rig.realtime))
-        cycle = ControlCycle(preparation, boot_id, links, pulse, orders)
+        cycle = ControlCycle(preparation, boot_id, Links(buses, channel, operators, telemetry, recorder), pulse, orders)
         loop = PeriodicLoop(TICK_NS, pulse.lateness)
         while not cycle.is_over:
             cycle.step(loop.wait(), loop.overruns)

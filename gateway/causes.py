@@ -45,6 +45,7 @@ class Cause(Enum):
     YAW_RATE_IMPLAUSIBLE = Meaning(27, "yaw rate and heading contradict each other", "rad/s")
     STEERING_IMPLAUSIBLE = Meaning(28, "steering angle moves impossibly fast", "rad/s")
     STEERING_NOT_FOLLOWING = Meaning(29, "steering robot does not follow", "rad")
+    FRAMES_LOST = Meaning(30, "frames are lost", "%")
     COMMAND_FAILED = Meaning(40, "controller failed", "")
     COMMAND_LOST = Meaning(41, "controller silent", "ms")
     COMMAND_INVALID = Meaning(42, "commands are invalid", "")

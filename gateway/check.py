@@ -6,6 +6,7 @@ from typing import Any
 
 from dbc.errors import SetupFailure
 from dbc.link import CanLink, LinkError
+from gateway.keys import check_secret
 from gateway.preparation import Preparation, configuration
 from gateway.rig import Rig
 
@@ -14,12 +15,14 @@ def check_machine(rig: Rig) -> None:
     """Look for what would keep a gateway from starting on this machine; buses may still come.
 
     Raises:
-        KeyMistake: the key file is not usable.
+        KeyMistake: a key file is not usable.
         SetupFailure: a directory is missing or not writable; one line for each.
     """
     control = rig.control.path
     if rig.control.key is not None or control.key_file.exists():
         control.key()
+    if rig.telemetry.tls is not None:
+        check_secret(rig.telemetry.tls.private_key)
     directories = {"control.directory": control.directory}
     if rig.recorder is not None:
         directories["recorder.directory"] = rig.recorder.directory

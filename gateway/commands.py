@@ -1,5 +1,6 @@
 """What the gateway believes of a command before anything else looks at it."""
 
+import math
 from collections import Counter
 
 from gateway.messages import CommandStatus, ControlCommand
@@ -22,6 +23,7 @@ class CommandGate:
 
     Attributes:
         newest: the last command that carries a usable plan, or None.
+        degraded_in_a_row: commands of status DEGRADED since the last other one.
         status: what the last admitted command says of itself.
         good_in_a_row: commands of status OK since the last other one.
         bad_in_a_row: rejected ones since the last admitted one.
@@ -39,6 +41,7 @@ class CommandGate:
         self.newest: ControlCommand | None = None
         self.status = CommandStatus.OK
         self.good_in_a_row = 0
+        self.degraded_in_a_row = 0
         self.bad_in_a_row = 0
         self.strangers = 0
         self.last_cause = ""
@@ -66,6 +69,7 @@ class CommandGate:
         self._boot_id, self._last_seq, self._admitted_ns = command.boot_id, command.seq, now_ns
         self.status = command.status
         self.good_in_a_row = self.good_in_a_row + 1 if command.status is CommandStatus.OK else 0
+        self.degraded_in_a_row = self.degraded_in_a_row + 1 if command.status is CommandStatus.DEGRADED else 0
         if command.status is not CommandStatus.FAILED:
             self.newest = command
         return True
@@ -80,7 +84,8 @@ class CommandGate:
             ("repeated or old sequence number", command.boot_id == self._boot_id and command.seq <= self._last_seq),
             ("answers an old state", not state_seq - MAX_STATE_LAG <= command.state_seq <= state_seq),
             ("time of another clock", abs(command.t_ns - now_ns) > MAX_CLOCK_OFFSET_NS),
-            ("steering out of range", any(abs(steer) > STEER_RANGE_RAD for steer in command.plan_steer_rad)),
-            ("drive out of range", any(abs(drive) > DRIVE_RANGE_NORM for drive in command.plan_drive_norm)),
+            ("steering out of range", not all(abs(steer) <= STEER_RANGE_RAD for steer in (command.steer_rad, *command.plan_steer_rad))),
+            ("drive out of range", not all(abs(drive) <= DRIVE_RANGE_NORM for drive in (command.drive_norm, *command.plan_drive_norm))),
+            ("path error is no number", not math.isfinite(command.lateral_error_m + command.heading_error_rad)),
         )
         return next((name for name, is_true in causes if is_true), None)

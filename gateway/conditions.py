@@ -14,6 +14,8 @@ COMMAND_TIMEOUT_NS = 100_000_000
 """Age at which a command is too old: one missed solve is tolerated, two are not."""
 MAX_BAD_COMMANDS = 2
 """Commands in a row, and of a second sender, that are only counted and dropped."""
+MAX_DEGRADED = 3
+"""Shifted plans in a row that are followed."""
 MAX_TICK_GAP_NS = 50_000_000
 """A gateway that slept longer must not go on with what it did before."""
 MAX_UNCONFIRMED_NS = 50_000_000
@@ -108,7 +110,7 @@ def state_findings(s: Situation) -> list[Finding]:
 
 
 _STATE_CAUSES = (
-    *(Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID, Cause.SPEED_IMPLAUSIBLE, Cause.POSITION_IMPLAUSIBLE),
+    *(Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID, Cause.FRAMES_LOST, Cause.SPEED_IMPLAUSIBLE, Cause.POSITION_IMPLAUSIBLE),
     *(Cause.YAW_RATE_IMPLAUSIBLE, Cause.STEERING_IMPLAUSIBLE),
 )
 
@@ -172,6 +174,7 @@ def _command_findings(s: Situation) -> Judged:
     age_ms, limit_ms = min(c.age_ns(s.now_ns) * _MS_PER_NS, 1e6), COMMAND_TIMEOUT_NS * _MS_PER_NS
     return (
         (c.status is CommandStatus.FAILED, Finding(Cause.COMMAND_FAILED, 1, 0, "controller")),
+        (c.degraded_in_a_row > MAX_DEGRADED, Finding(Cause.COMMAND_FAILED, c.degraded_in_a_row, MAX_DEGRADED, "controller (degraded)")),
         (age_ms > limit_ms, Finding(Cause.COMMAND_LOST, age_ms, limit_ms, sender)),
         (c.bad_in_a_row > MAX_BAD_COMMANDS, Finding(Cause.COMMAND_INVALID, c.bad_in_a_row, MAX_BAD_COMMANDS, c.last_cause)),
         (c.strangers > MAX_BAD_COMMANDS, Finding(Cause.SECOND_CONTROLLER, c.strangers, MAX_BAD_COMMANDS, "controller")),

@@ -118,14 +118,13 @@ class Housekeeper:
         while not self._closing.wait(_PERIOD_S):
             self._round()
         self._log_events()
+        self._tell_stopping()
 
     def _round(self) -> None:
         self._check_progress()
         self._log_events()
         self._tell_status()
-        if self._orders.ends and not self._is_stopping:
-            self._is_stopping = True
-            self._notifier.stopping()
+        self._tell_stopping()
         if self._orders.is_reload_asked:
             self._orders.is_reload_asked = False
             self._reload()
@@ -148,6 +147,11 @@ class Housekeeper:
                 log.log(event.level, "%s", event.text, extra=dict(event.fields))
             else:
                 log_transition(event)
+
+    def _tell_stopping(self) -> None:
+        if self._orders.ends and not self._is_stopping:
+            self._is_stopping = True
+            self._notifier.stopping()
 
     def _tell_status(self) -> None:
         if (status := self._pulse.status) is None:
@@ -184,6 +188,7 @@ class Housekeeper:
     def __exit__(self, *_: object) -> None:
         self._closing.set()
         self._thread.join()
+        self._notifier.pausing()
 
 
 def log_transition(transition: Transition) -> None:

@@ -7,11 +7,11 @@ straight ahead with the jerk j, j t^3 / 6. With the largest acceleration held fo
 | profile        | a, lateral | held 250 ms | from straight | held 500 ms | a, drive | held 500 ms |
 |----------------|------------|-------------|---------------|-------------|----------|-------------|
 | nominal        |  3 m/s2    | 0.09 m      | 0.013 m       | 0.38 m      | 2.0 m/s2 | 1.0 m/s     |
-| proving_ground |  9 m/s2    | 0.28 m      | 0.26 m        | 1.13 m      | 3.3 m/s2 | 1.7 m/s     |
+| proving_ground |  9 m/s2    | 0.28 m      | 0.23 m        | 1.13 m      | 3.3 m/s2 | 1.7 m/s     |
 | bench          |  1 m/s2    | 0.03 m      | 0.005 m       | 0.13 m      | 1.0 m/s2 | 0.5 m/s     |
 
 The 9 m/s2 are what tyres on dry asphalt give; the kinematic bound of proving_ground is above them, because a car that understeers or
-counter-steers needs angles that no tyre can follow. From straight they are there after 45 ms: 0.26 m.
+counter-steers needs angles that no tyre can follow. From straight they are there after 45 ms.
 """
 
 import math
@@ -42,8 +42,8 @@ class LimitProfile:
         steering_wheel_rate_radps: largest rate of the steering-wheel angle [rad/s].
         lateral_acceleration_mps2, lateral_jerk_mps3: largest kinematic lateral acceleration, and its rate at the present speed.
         acceleration_mps2, deceleration_mps2: largest of accelerator and brake.
-        drive_jerk_mps3: largest rate at which the brake is released and the accelerator pressed.
-        brake_jerk_mps3: largest rate at which the brake is pressed; the accelerator may be released at once.
+        drive_jerk_mps3: largest rate at which the accelerator is pressed; it may be released at once.
+        brake_jerk_mps3: largest rate at which the brake is pressed or released.
         comfort_stop, safe_stop: the two grades of a stop.
         max_speed_mps: largest speed at which the gateway drives.
         standstill_brake_norm: brake pedal that holds the car after a stop, share of the stroke.
@@ -67,7 +67,7 @@ class LimitProfile:
 NOMINAL = LimitProfile(
     name="nominal",
     steering_wheel_limit_rad=18.85,  # three turns, the range of a steering robot: the end stop of the car acts first
-    steering_wheel_rate_radps=7.0,  # 400 deg/s; assumption: ordinary driving stays below
+    steering_wheel_rate_radps=13.9,  # as proving_ground, for parking; at speed the lateral jerk is what limits
     lateral_acceleration_mps2=3.0,  # ISO 11270, as in opendbc
     lateral_jerk_mps3=5.0,  # ISO 11270; opendbc takes 3.6 of them
     acceleration_mps2=2.0,  # adaptive cruise control in opendbc, from ISO 15622
@@ -88,7 +88,7 @@ PROVING_GROUND = LimitProfile(
     lateral_jerk_mps3=200.0,  # from one end of the range above to the other in 0.15 s; ISO 3888-1 at 80 km/h needs 57, mean over 250 ms
     acceleration_mps2=3.3,  # full accelerator of the cars of dbc/: 3.2 and 2.9 m/s2
     deceleration_mps2=10.0,  # full brake: 1 g
-    drive_jerk_mps3=16.0,  # 3.2 m/s2 in 0.2 s, as fast as the engine
+    drive_jerk_mps3=20.0,  # six strokes a second, as fast as the accelerator robot of the Focus (19.4 m/s3)
     brake_jerk_mps3=64.0,  # 1 g in 0.15 s: braking must not wait for the limiter
     comfort_stop=COMFORT_STOP,
     safe_stop=EMERGENCY_STOP,

@@ -18,15 +18,20 @@ _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", 
 _SYSLOG_LEVELS = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 
 
+def escaped(text: str) -> str:
+    """The text with what is not printable as Python would write it: nobody's text makes lines of its own, or commands a terminal."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
+
+
 class PlainFormatter(logging.Formatter):
-    """For people; what is not printable in a message is escaped, so that nobody's text makes lines of its own."""
+    """For people; see `escaped`."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(name)s %(message)s")
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - the name of the standard library
         """The line of a record."""
-        record.message = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in record.message)
+        record.message = escaped(record.message)
         return super().formatMessage(record)
 
 

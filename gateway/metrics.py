@@ -23,6 +23,7 @@ _PREFIX = "xilgate_gateway_"
 _REQUEST_TIMEOUT_S = 2.0
 _PAUSE_S = 0.05
 """Pause after every request [s]: whoever asks in a loop gets no more than a few per cent of a processor."""
+_POLL_S = 0.1
 _S_PER_NS = 1e-9
 
 
@@ -132,7 +133,7 @@ class MetricsServer:
             self._server = make_server("127.0.0.1", port, make_wsgi_app(registry), _Server, _Handler)
         except OSError as error:
             raise MetricsError(f"metrics.port = {port}: {error.strerror or error}; allowed: a free port") from error
-        self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)
+        self._thread = threading.Thread(target=self._server.serve_forever, args=(_POLL_S,), name="metrics", daemon=True)
 
     def __enter__(self) -> Self:
         self._thread.start()

@@ -54,6 +54,7 @@ REACTIONS: Mapping[Cause, Trigger] = {
     Cause.YAW_RATE_IMPLAUSIBLE: Trigger.STOP,
     Cause.STEERING_IMPLAUSIBLE: Trigger.STOP,
     Cause.STEERING_NOT_FOLLOWING: Trigger.STOP,
+    Cause.FRAMES_LOST: Trigger.STOP,
     Cause.COMMAND_FAILED: Trigger.STOP,
     Cause.COMMAND_LOST: Trigger.STOP,
     Cause.COMMAND_INVALID: Trigger.STOP,

@@ -13,9 +13,10 @@ from gateway.causes import Cause, Finding
 from gateway.codec import Measurement
 from gateway.limits import Demand, clamp
 
-SPEED_LIMIT_MPS, SPEED_LIMIT_SHARE = 2.0, 0.1
-"""Difference of the speeds of wheels and navigation: opendbc's 2 m/s, and above 72 km/h the slip at which anti-lock brakes hold wheels."""
+SPEED_LIMIT_MPS = 2.0
+"""Difference of the speeds of wheels and navigation, as in opendbc. In undisturbed drives 0.8 m/s."""
 SPEED_HOLD_NS = 100_000_000
+"""Wheels that slip for a moment are no fault of a sensor."""
 
 MOTION_WINDOW_MS = 100
 """Over this time position and heading are held against speed and yaw rate: ten measurements of the navigation system."""
@@ -147,10 +148,9 @@ class Plausibility:
             self._navigation_time_ms = m.navigation_time_ms
             self._motion.update(m)
         wheels_mps = median(m.wheel_speed_radps) * self._wheel_radius_m
-        speed_limit_mps = max(SPEED_LIMIT_MPS, SPEED_LIMIT_SHARE * abs(m.vx_mps))
         position_limit_m = clamp(0.5 * abs(m.vx_mps) * MOTION_WINDOW_MS * 1e-3, *POSITION_LIMITS_M)
         checks = (
-            (self._speed, Cause.SPEED_IMPLAUSIBLE, 0.0 if self._is_on_lift else wheels_mps - m.vx_mps, speed_limit_mps),
+            (self._speed, Cause.SPEED_IMPLAUSIBLE, 0.0 if self._is_on_lift else wheels_mps - m.vx_mps, SPEED_LIMIT_MPS),
             (self._position, Cause.POSITION_IMPLAUSIBLE, self._motion.position_error_m, position_limit_m),
             (self._yaw_rate, Cause.YAW_RATE_IMPLAUSIBLE, self._motion.yaw_rate_error_radps, YAW_RATE_LIMIT_RADPS),
         )

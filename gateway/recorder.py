@@ -35,6 +35,8 @@ REPORT_PERIOD_S = 0.5
 MAX_REPORT_AGE_NS = 2_000_000_000
 """A recorder that has not reported for longer is none."""
 _SEND_BUFFER_BYTES = 4 << 20
+_POLL_PERIOD_NS = 100_000_000
+"""Reports come twice a second: to look for one in every tick would cost more than to record it."""
 _MAX_REPORTS_PER_POLL = 16
 _MAX_REPORT_BYTES = 8192
 _START_S = 20.0
@@ -89,7 +91,7 @@ class Recorder:
         self._seq = 0
         self._lost = 0
         self._report = _Report(0, 0, 0.0, "")
-        self._report_ns = 0
+        self._report_ns = self._polled_ns = 0
         self._has_ended = False
         networks = {arbitration_id: spec.network for arbitration_id, spec in catalogue.by_id.items()}
         self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
@@ -98,6 +100,7 @@ class Recorder:
             _enlarge(self._socket)
             self._process = _start(theirs, _Task(options, pack_value(session), networks, session.wall_offset_ns))
         self._await_first_report()
+        self._status = self._look(time.monotonic_ns())
 
     @property
     def pid(self) -> int:
@@ -117,7 +120,14 @@ class Recorder:
             self._lost += 1
 
     def poll(self, now_ns: int) -> RecorderStatus:
-        """Take in what the recorder has reported; never waits."""
+        """What is known of the recorder, as of a tenth of a second ago at most; never waits."""
+        if now_ns - self._polled_ns >= _POLL_PERIOD_NS:
+            self._polled_ns = now_ns
+            self._status = self._look(now_ns)
+        return self._status
+
+    def _look(self, now_ns: int) -> RecorderStatus:
+        """Take in what the recorder has reported."""
         for _ in range(_MAX_REPORTS_PER_POLL):
             if not self._take_report(now_ns):
                 break

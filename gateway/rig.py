@@ -12,7 +12,7 @@ from dbc.section import Section, between, checked, misfit, read_toml
 from gateway.channel import ControlPath, control_path
 from gateway.limits import PROFILES
 from gateway.record.files import BusFormat
-from gateway.telemetry import DEFAULT_BASE_PORT
+from gateway.telemetry import DEFAULT_BASE_PORT, TlsSection
 
 _SHA256_DIGITS = 64
 
@@ -115,9 +115,11 @@ class Telemetry(Section):
 
     Args:
         base_port: first of five neighbouring ports of the loopback interface.
+        tls: for readers on other machines; None for none.
     """
 
     base_port: Port = DEFAULT_BASE_PORT
+    tls: TlsSection | None = None
 
 
 class Recording(Section):

@@ -5,7 +5,7 @@ counted by cause and ignored at once: bad data and no data are the same thing. A
 is invalid until it has been good for a while, even though enough good ones come in between.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 
 from dbc.catalogue import Catalogue, DecodeError, MessageSpec
@@ -18,6 +18,12 @@ MAX_BAD_FRAMES = 2
 """Bad frames among the last `WINDOW_FRAMES` of a message that are only counted; one more, and the message is invalid."""
 RECOVERY_NS = 1_000_000_000
 """How long an invalid message has to be good before it counts again [ns]."""
+
+FLOW_WINDOW_NS = 130_000_000
+"""Time over which losses are counted [ns]: with 20 % lost the reaction is to come within 150 ms."""
+MAX_LOST_FRAMES = 8
+"""Frames lost in that time that are only counted, of about 160: with 1 % lost there are 2, with 20 % there are 31."""
+MAX_FLOW_CYCLE_NS = 10_000_000
 
 _WINDOW_MASK = (1 << WINDOW_FRAMES) - 1
 _MS_PER_NS = 1e-6
@@ -73,6 +79,38 @@ class MessageWatch:
         return None
 
 
+class Flow:
+    """How many of the frames that should come do come: losses that no single message shows, because each is soon followed by a good frame.
+
+    Args:
+        specs: the messages to count; those slower than `MAX_FLOW_CYCLE_NS` would say something too late.
+    """
+
+    def __init__(self, specs: Iterable[MessageSpec]) -> None:
+        cycles_ns = [spec.cycle_time_ns for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS]
+        self._frames_per_ns = sum(1.0 / cycle_ns for cycle_ns in cycles_ns)
+        self._jitter_frames = len(cycles_ns)  # one of each message may just be on its way
+        self._good = 0
+        self._history: deque[tuple[int, int]] = deque()
+
+    def note_good(self, spec: MessageSpec) -> None:
+        """Count a good frame."""
+        self._good += spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS
+
+    def finding(self, now_ns: int) -> Finding | None:
+        """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
+        self._history.append((now_ns, self._good))
+        while len(self._history) > 1 and self._history[1][0] <= now_ns - FLOW_WINDOW_NS:
+            self._history.popleft()
+        then_ns, good_then = self._history[0]
+        if now_ns - then_ns < FLOW_WINDOW_NS:
+            return None
+        expected = (now_ns - then_ns) * self._frames_per_ns
+        lost = expected - (self._good - good_then)
+        limit = self._jitter_frames + MAX_LOST_FRAMES
+        return Finding(Cause.FRAMES_LOST, 100.0 * lost / expected, 100.0 * limit / expected, "buses") if lost > limit else None
+
+
 class Supervisor:
     """Accepts or rejects frames and watches the messages it is told to need.
 
@@ -90,6 +128,7 @@ class Supervisor:
         self._watches = {catalogue.by_name[name].arbitration_id: MessageWatch(catalogue.by_name[name]) for name in needed}
         self._by_name = {watch.spec.name: watch for watch in self._watches.values()}
         self._own = {arbitration_id: spec for arbitration_id, spec in catalogue.by_id.items() if spec.sender == node}
+        self._flow = Flow(watch.spec for watch in self._watches.values())
         self._impostor: Finding | None = None
         self.received = 0
         self.rejected: Counter[str] = Counter()
@@ -110,7 +149,9 @@ class Supervisor:
                 except DecodeError:
                     cause = "range"
             watch.note(frame.t_ns, cause is None)
-            if cause is not None:
+            if cause is None:
+                self._flow.note_good(watch.spec)
+            else:
                 self.rejected[f"{watch.spec.name}: {cause}"] += 1
         return values
 
@@ -129,5 +170,5 @@ class Supervisor:
     def findings(self, now_ns: int) -> list[Finding]:
         """What is wrong with the messages now, and, once, that somebody else has sent ours."""
         impostor, self._impostor = self._impostor, None
-        found = [finding for watch in self._watches.values() if (finding := watch.finding(now_ns)) is not None]
-        return found if impostor is None else [impostor, *found]
+        candidates = [impostor, self._flow.finding(now_ns), *(watch.finding(now_ns) for watch in self._watches.values())]
+        return [finding for finding in candidates if finding is not None]

@@ -4,6 +4,9 @@ import os
 import socket
 from collections.abc import Mapping
 
+PAUSE_S = 30.0
+"""Longest time in which a gateway may close its files and begin anew [s]."""
+
 
 class Notifier:
     """Tells the service manager how the process is; nothing happens where there is none.
@@ -23,12 +26,20 @@ class Notifier:
 
     def ready(self, watchdog_s: float) -> None:
         """The process works; from now on it is to be restarted when it is silent for longer than `watchdog_s` [s]."""
-        self._send("READY=1" + (f"\nWATCHDOG_USEC={round(watchdog_s * 1e6)}\nWATCHDOG=1" if self._is_watched else ""))
+        self._send("READY=1" + self._patience(watchdog_s))
 
     def alive(self) -> None:
         """The process makes progress."""
         if self._is_watched:
             self._send("WATCHDOG=1")
+
+    def pausing(self) -> None:
+        """The control loop has ended; what follows, an end or another beginning, takes its time."""
+        if self._is_watched:
+            self._send(self._patience(PAUSE_S).strip())
+
+    def _patience(self, watchdog_s: float) -> str:
+        return f"\nWATCHDOG_USEC={round(watchdog_s * 1e6)}\nWATCHDOG=1" if self._is_watched else ""
 
     def status(self, text: str) -> None:
         """What the process does, in one line for people; sent when it changes."""

@@ -7,13 +7,16 @@ passes as it is, or not at all. Dropping is safe, because robots that hear no co
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 
-from dbc.catalogue import Catalogue, DecodeError, MessageSpec
+from dbc.catalogue import Catalogue, CatalogueError, DecodeError, MessageSpec
 from dbc.frame import CanFrame
 from gateway.messages import Mode
 
 RATE_CYCLES = 10
 MAX_FRAMES = 12
 """Of one message at most 12 frames in any 10 of its periods: 1.2 times its rate, as in opendbc, and room for a late frame."""
+
+DIAGNOSTIC_IDS = frozenset({0x7DF, *range(0x7E0, 0x7F0)})
+"""Requests and answers of diagnosis (ISO 15765-4): the gateway never sends them, whatever a DBC says."""
 
 _REQUESTS: Mapping[Mode, frozenset[str]] = {
     Mode.STANDBY: frozenset({"None", "Disarm"}),
@@ -38,11 +41,17 @@ class TransmitGate:
 
     Attributes:
         rejected: dropped frames by cause.
+
+    Raises:
+        CatalogueError: the DBC wants the gateway to send a diagnostic message.
     """
 
     def __init__(self, catalogue: Catalogue, node: str = "GW") -> None:
         self._catalogue = catalogue
         self._allowed: dict[int, MessageSpec] = {spec.arbitration_id: spec for spec in catalogue.by_name.values() if spec.sender == node}
+        for spec in self._allowed.values():
+            if spec.arbitration_id in DIAGNOSTIC_IDS:
+                raise CatalogueError(f"message {spec.name} (id 0x{spec.arbitration_id:X}): 0x7DF and 0x7E0 to 0x7EF are for diagnosis")
         self._request_names = {raw: name for name, raw in catalogue.enumeration("GW_SafetyCommand", "SystemRequest").items()}
         commands = [spec.name for spec in self._allowed.values() if "Enable" in catalogue.signals(spec.name)]
         self._mode_names = {name: {raw: mode for mode, raw in catalogue.enumeration(name, "Mode").items()} for name in commands}

@@ -26,13 +26,17 @@ ALLOWED_IMPORTS = {
 
 # Modules that decide: same input, same output, in virtual time as in real time.
 PURE_MODULES = {
-    "dbc": ("frame", "catalogue", "packing", "e2e", "database", "mapping", "lint", "difference", "vehicle", "section", "multibody"),
+    "dbc": (
+        *("frame", "catalogue", "packing", "e2e", "database", "mapping", "lint", "difference", "vehicle", "section", "multibody"),
+        *("health", "watchdog", "error_frames", "bus_monitor", "recovery", "confirmation", "traffic", "frame_length"),
+    ),
     "gateway": (
         *("messages", "codec", "supervision", "commands", "conditions", "modes"),
-        *("limits", "actuation", "safe_stop", "core"),
+        *("limits", "actuation", "safe_stop", "core", "journal"),
     ),
     "controller": (
         *("problem", "model", "integrator", "ocp", "delay", "disturbance", "estimator", "nmpc", "fallback", "parameters", "objects"),
+        "journal",
         *(f"planning/{name}" for name in ("planner", "options", "localiser", "obstacles", "corridor", "shift", "linking", "passing")),
         *("planning/speed", "planning/reference", "planning/reference_sources"),
     ),

@@ -63,13 +63,18 @@ class BusListener:
 
     Args:
         bus_names: `INTERFACE:CHANNEL` of each; one that is named twice is recorded once.
+
+    Attributes:
+        problem: why the record ends early, in one line; empty while it goes on.
     """
 
     def __init__(self, bus_names: Iterable[str], path: Path) -> None:
         self._is_closing = threading.Event()
         self._threads: list[threading.Thread] = []
+        self.problem = ""
         with contextlib.ExitStack() as opening:
-            self._log = opening.enter_context(BusLog(path))
+            self._log = BusLog(path)
+            opening.callback(self._close_log)
             for interface, _, channel in (name.partition(":") for name in dict.fromkeys(bus_names)):
                 bus = opening.enter_context(can.Bus(interface=interface, channel=channel))
                 self._threads.append(threading.Thread(target=self._record, args=(bus, channel), name=f"bus log {channel}", daemon=True))
@@ -78,16 +83,28 @@ class BusListener:
             thread.start()
 
     def _record(self, bus: can.BusABC, channel: str) -> None:
-        while not self._is_closing.is_set():
+        while not self._is_closing.is_set() and not self.problem:
             try:
                 message = bus.recv(timeout=0)
             except (can.CanError, OSError):
                 return  # the bus has gone; whoever runs it says so
-            if message is None:
-                self._log.flush()
-                time.sleep(_POLL_S)
-            elif not (message.is_error_frame or message.is_remote_frame):
-                self._log.write(channel, CanFrame(message.arbitration_id, bytes(message.data), round(message.timestamp * _NS_PER_S)))
+            try:
+                self._keep(channel, message)
+            except OSError as error:
+                self.problem = f"the bus record ends early: {error.strerror or error}"
+
+    def _keep(self, channel: str, message: can.Message | None) -> None:
+        if message is None:
+            self._log.flush()
+            time.sleep(_POLL_S)
+        elif not (message.is_error_frame or message.is_remote_frame):
+            self._log.write(channel, CanFrame(message.arbitration_id, bytes(message.data), round(message.timestamp * _NS_PER_S)))
+
+    def _close_log(self) -> None:
+        try:
+            self._log.close()
+        except OSError as error:
+            self.problem = self.problem or f"the bus record ends early: {error.strerror or error}"
 
     @property
     def frames(self) -> int:

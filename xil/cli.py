@@ -24,8 +24,10 @@ from xil.cli_common import (
     JsonOption,
     KeyOption,
     PortOption,
+    RigOption,
     VehicleOption,
     exit_code_of,
+    refuse_beside_rig,
     run_daemon,
     show,
     stop_on_signal,
@@ -56,14 +58,15 @@ CHANNELS = list(NETWORKS)
 
 def main() -> None:
     """Run the command line; the only place that turns an exception into an exit code."""
-    from xil.processes import die_with_parent  # noqa: PLC0415 - imports are late so that every command starts quickly
+    from gateway.logs import escaped  # noqa: PLC0415 - imports are late so that every command starts quickly
+    from xil.processes import die_with_parent  # noqa: PLC0415
 
     die_with_parent()
     try:
         app()
     except (UserMistake, SetupFailure) as error:
         for line in str(error).splitlines():
-            print(f"xilgate: {line}", file=sys.stderr)
+            print(f"xilgate: {escaped(line)}", file=sys.stderr)
         sys.exit(exit_code_of(error))
 
 
@@ -116,7 +119,10 @@ def drive(
 
 @app.command()
 def controller(
+    context: typer.Context,
+    *,
     reference: Annotated[Path, typer.Option(help="path to follow, CSV")],
+    rig: RigOption = None,
     vehicle: VehicleOption = FOCUS,
     solver: SolverOption = None,
     control: ControlOption = None,
@@ -127,16 +133,22 @@ def controller(
     """The controller process: planner and NMPC at 25 Hz."""
     from gateway.channel import control_path  # noqa: PLC0415
 
+    if rig is None:
+        common = {"vehicle_path": vehicle, "control": control_path(control, key), "telemetry_base_port": telemetry_port}
+    else:
+        from gateway.rig import read_rig  # noqa: PLC0415
+
+        refuse_beside_rig(context, "reference", "solver", "journal")
+        found = read_rig(rig)
+        common = {
+            "vehicle_path": found.car.vehicle,
+            "control": found.control.path,
+            "telemetry_base_port": found.telemetry.base_port,
+            "tls": found.telemetry.tls,
+        }
     run_daemon(
         "controller.app",
-        lambda m: m.ControllerOptions(
-            reference_csv=reference,
-            vehicle_path=vehicle,
-            control=control_path(control, key),
-            solver=solver or m.DEFAULT_SOLVER,
-            telemetry_base_port=telemetry_port,
-            journal=journal,
-        ),
+        lambda m: m.ControllerOptions(reference_csv=reference, solver=solver or m.DEFAULT_SOLVER, journal=journal, **common),
     )
 
 

@@ -24,6 +24,9 @@ ControlOption = Annotated[
     Path | None, typer.Option("--control", help="directory of the control sockets and their key; default: one of the user's own")
 ]
 KeyOption = Annotated[Path | None, typer.Option("--key", help="key file of the rig; default: the key in the directory of the sockets")]
+RigOption = Annotated[
+    Path | None, typer.Option("--rig", help="rig file of the gateway, for what both have in common: sockets, key, ports, vehicle")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="one JSON object instead of a table")]
 
 
@@ -38,7 +41,11 @@ def stop_on_signal() -> Iterator[threading.Event]:
 
 def run_daemon(module: str, make_options: Callable[[Any], object]) -> None:
     """Run `module.run` with its options until a signal comes."""
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(message)s", stream=sys.stderr)
+    from gateway.logs import PlainFormatter  # noqa: PLC0415 - imports are late so that every command starts quickly
+
+    handler = logging.StreamHandler()
+    handler.setFormatter(PlainFormatter())
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
     daemon = importlib.import_module(module)
     with stop_on_signal() as stop:
         daemon.run(make_options(daemon), stop)
@@ -47,6 +54,18 @@ def run_daemon(module: str, make_options: Callable[[Any], object]) -> None:
 def exit_code_of(error: UserMistake | SetupFailure) -> int:
     """Exit code of a command that such an error ends."""
     return EXIT_USER if isinstance(error, UserMistake) else EXIT_SETUP
+
+
+def refuse_beside_rig(context: typer.Context, *allowed: str) -> None:
+    """Refuse settings beside a rig file: nobody would find them again.
+
+    Args:
+        allowed: parameters of the command that are no settings of the rig.
+    """
+    for name in context.params.keys() - {"rig", *allowed}:
+        source = context.get_parameter_source(name)
+        if source is not None and source.name != "DEFAULT":
+            raise UserMistake(f"--{name.replace('_', '-')}: not beside --rig; write it into the rig file")
 
 
 def progress(text: str) -> None:

@@ -11,14 +11,13 @@ from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import FOCUS
 from gateway.telemetry import DEFAULT_BASE_PORT
-from xil.cli_common import ControlOption, DbcOption, JsonOption, KeyOption, PortOption, VehicleOption, exit_code_of, show
+from xil.cli_common import ControlOption, DbcOption, JsonOption, KeyOption, PortOption, VehicleOption, exit_code_of, refuse_beside_rig, show
 
 if TYPE_CHECKING:
     from gateway.rig import Rig
 
 driving = typer.Typer()
 DBC_FILES = [ROBOTS_DBC, GNSS_IMU_DBC]
-_WITH_RIG = {"rig", "is_check", "as_json"}
 
 
 @driving.command()
@@ -37,6 +36,7 @@ def gateway(
     profile: Annotated[str, typer.Option("--profile", help="limit profile")] = "proving_ground",
     control: ControlOption = None,
     key: KeyOption = None,
+    record: Annotated[Path | None, typer.Option("--record", help="directory for what `xilgate resim` needs; default: no record")] = None,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
     as_json: JsonOption = False,
 ) -> None:
@@ -48,7 +48,7 @@ def gateway(
         "car": {"dbc": list(map(str, dbc))} | _given(mapping=mapping, vehicle=vehicle),
         "control": _given(directory=control, key=key),
         "telemetry": {"base_port": telemetry_port},
-    }
+    } | ({} if record is None else {"recorder": {"directory": str(record), "formats": []}})
 
     def read() -> "Rig":
         from gateway.rig import make_rig, read_rig  # noqa: PLC0415 - imports are late so that every command starts quickly
@@ -56,7 +56,7 @@ def gateway(
         return make_rig(Path("command line"), tree, Path.cwd()) if rig is None else read_rig(rig)
 
     if rig is not None:
-        _refuse_other_options(context)
+        refuse_beside_rig(context, "is_check", "as_json")
     if is_check:
         _check(read, as_json)
     elif rig is None:
@@ -67,14 +67,6 @@ def gateway(
 
 def _given(**settings: str | Path | None) -> dict[str, Any]:
     return {name: str(value) for name, value in settings.items() if value is not None}
-
-
-def _refuse_other_options(context: typer.Context) -> None:
-    """A setting beside a rig file would be one that nobody finds again."""
-    for name in context.params.keys() - _WITH_RIG:
-        source = context.get_parameter_source(name)
-        if source is not None and source.name != "DEFAULT":
-            raise UserMistake(f"--{name.replace('_', '-')}: not beside --rig; write it into the rig file")
 
 
 def _check(read: Callable[[], "Rig"], as_json: bool) -> None:

@@ -7,7 +7,19 @@ from typing import Annotated
 import typer
 
 from gateway.telemetry import DEFAULT_BASE_PORT
-from xil.cli_common import EXIT_FAIL, ControlOption, JsonOption, KeyOption, PortOption, as_json_text, run_daemon, show, stop_on_signal
+from xil.cli_common import (
+    EXIT_FAIL,
+    ControlOption,
+    JsonOption,
+    KeyOption,
+    PortOption,
+    RigOption,
+    as_json_text,
+    refuse_beside_rig,
+    run_daemon,
+    show,
+    stop_on_signal,
+)
 
 live = typer.Typer()
 params = typer.Typer(help="Look at and change the parameters of a running controller.", no_args_is_help=True)
@@ -35,7 +47,10 @@ class Movement(StrEnum):
 
 @live.command()
 def operate(
+    context: typer.Context,
     operation: Annotated[OperationName, typer.Argument(help="what to ask of the gateway")],
+    *,
+    rig: RigOption = None,
     control: ControlOption = None,
     key: KeyOption = None,
     as_json: JsonOption = False,
@@ -44,7 +59,14 @@ def operate(
     from gateway.channel import control_path, operator_client  # noqa: PLC0415
     from gateway.messages import Operation  # noqa: PLC0415
 
-    with operator_client(control_path(control, key)) as client:
+    if rig is None:
+        path = control_path(control, key)
+    else:
+        from gateway.rig import read_rig  # noqa: PLC0415
+
+        refuse_beside_rig(context, "operation", "as_json")
+        path = read_rig(rig).control.path
+    with operator_client(path) as client:
         reply = client.ask(Operation[operation.name])
     if as_json:
         content = {"operation": operation.value, "granted": not reply.refusals, "mode": reply.mode.name, "refusals": reply.refusals}

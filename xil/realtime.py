@@ -128,12 +128,14 @@ class RealtimeRun:
             bitrates = [argument for network in channels for argument in ("--bitrate", str(setup.catalogue.bitrate_bps[network]))]
             processes.start("bus", ["bus", *channels.values(), *bitrates])
             self._await(processes, "bus", lambda: all(map(is_served, channels.values())))
-        stack.enter_context(BusListener(bus.names.values(), setup.bus_log))
+        listener = BusListener(bus.names.values(), setup.bus_log)
+        stack.callback(lambda: self._announce(listener.problem) if listener.problem else None)
+        stack.enter_context(listener)
         buses = ["--bus", bus.names[ROBOTS], "--navigation-bus", bus.names[NAVIGATION]]
         if setup.view_port is not None:
             processes.start("view", ["view", "--port", str(setup.view_port), *telemetry])
             self._announce(f"virtual world: http://127.0.0.1:{setup.view_port}/")
-        processes.start("gateway", ["gateway", *buses, *contract, *sockets])
+        processes.start("gateway", ["gateway", *buses, *contract, *sockets, "--record", str(setup.directory)])
         reference = ["--reference", str(setup.reference_csv), "--solver", setup.solver]
         journal = ["--journal", str(setup.directory)]
         processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets, *journal])

@@ -22,7 +22,7 @@ from dbc.frame import CanFrame
 from dbc.packing import DecodeError
 from dbc.vehicle import load_vehicle
 from gateway.core import GatewayCore
-from gateway.journal import GatewaySession, JournalError, pack_value, plain, unpack_step
+from gateway.journal import GatewaySession, JournalError, Session, pack_value, plain, unpack_step
 from gateway.limits import PROFILES, LimitProfile
 from xil.journal_files import Journal, find_journals
 
@@ -60,6 +60,7 @@ class Comparison:
 
     Args:
         of: "gateway" or "controller".
+        version, started_utc, sha256: of what was recorded, see `gateway.journal.Session`.
         steps: that were compared.
         compared: command frames of the gateway, or commands of the controller, that were compared.
         different: steps whose answer is another one.
@@ -71,6 +72,9 @@ class Comparison:
 
     of: str
     source: str
+    version: str
+    started_utc: str
+    sha256: Mapping[str, str]
     steps: int
     compared: int
     different: int
@@ -104,9 +108,10 @@ def resim(path: Path, progress: Progress) -> list[Comparison]:
 class _Tally:
     """Compares answers as they come."""
 
-    def __init__(self, of: str, journal: Journal, notes: Iterable[str]) -> None:
+    def __init__(self, of: str, journal: Journal, session: Session, notes: Iterable[str]) -> None:
         self._of = of
         self._journal = journal
+        self._session = session
         self._notes = tuple(notes)
         self._steps = self._compared = self._different = 0
         self._first: Difference | None = None
@@ -132,10 +137,21 @@ class _Tally:
 
     def result(self) -> Comparison:
         """What came of it."""
+        session = self._session
         return Comparison(
-            self._of, self._journal.name, self._steps, self._compared, self._different, self._first, self._notes,
-            self._missing, self._journal.cut,
-        )  # fmt: skip
+            of=self._of,
+            source=self._journal.name,
+            version=session.version,
+            started_utc=session.started_utc,
+            sha256=session.sha256,
+            steps=self._steps,
+            compared=self._compared,
+            different=self._different,
+            first=self._first,
+            notes=self._notes,
+            missing=self._missing,
+            cut=self._journal.cut,
+        )
 
 
 def _resim_gateway(journal: Journal, progress: Progress) -> Comparison:
@@ -144,7 +160,7 @@ def _resim_gateway(journal: Journal, progress: Progress) -> Comparison:
     if profile is None:
         raise JournalError(f"{journal.name}: limit profile {session.profile!r}: there are {', '.join(PROFILES)}")
     catalogue, core = _core_of(session, profile)
-    tally = _Tally("gateway", journal, _notes(session, profile))
+    tally = _Tally("gateway", journal, session, _notes(session, profile))
     for record in journal.records():
         step = unpack_step(record, f"{journal.name}: step")
         if not tally.is_next(step.seq, step.arguments.now_ns):
@@ -179,7 +195,7 @@ def _resim_controller(journal: Journal, progress: Progress) -> Comparison:
     session = journal.session(ControllerSession)
     clock = RecordedClock()
     nmpc, store = _nmpc_of(session, clock, progress)
-    tally = _Tally("controller", journal, ())
+    tally = _Tally("controller", journal, session, ())
     for record in journal.records():
         cycle = unpack_cycle(record, f"{journal.name}: step")
         if not tally.is_next(cycle.seq, cycle.now_ns):

@@ -4,7 +4,6 @@ from enum import StrEnum
 
 import msgspec
 
-
 MAX_SAMPLE_BYTES = 1 << 22
 """Longest payload that is looked at [bytes]: a scene with some 30,000 points."""
 
@@ -71,6 +70,7 @@ class CommandSample(Sample, frozen=True, kw_only=True):
         parameters_version: version of the parameters that were in force.
         objects: objects that the planner was given.
         objects_rejected: things on the topic of the objects that were none, since the start of the controller.
+        controller_sha256: of all that the controller decides with: compiled solver, vehicle file, path.
     """
 
     state_seq: int
@@ -91,6 +91,7 @@ class CommandSample(Sample, frozen=True, kw_only=True):
     parameters_version: int
     objects: int
     objects_rejected: int
+    controller_sha256: str = ""
 
 
 class PlanSample(Sample, frozen=True, kw_only=True):

@@ -1,6 +1,5 @@
 """The link on every kind of bus: same frames, never an exception, and a dead bus that shows; and several links as one car's."""
 
-import tempfile
 import threading
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,42 +9,12 @@ import pytest
 
 from dbc.catalogue import load
 from dbc.frame import CanFrame
+from dbc.health import BusState
 from dbc.link import MAX_FRAMES_PER_RECEIVE, BusSet, CanLink, LinkError, bus_names
 from tests.support.processes import wait_until
-from vehicle_emulator.bus.hub import Hub
 from xil.bus import socketcan_problem
 
 PATIENCE_S = 20.0
-
-
-class ServedChannel:
-    """A hub whose turns run in a thread until it is stopped."""
-
-    def __init__(self, channel):
-        self.hub = Hub(channel)
-        self.stopping = threading.Event()
-        self.thread = threading.Thread(target=self._turns)
-        self.thread.start()
-
-    def _turns(self):
-        while not self.stopping.is_set():
-            self.hub.turn(0.02)
-
-    def stop(self):
-        self.stopping.set()
-        self.thread.join()
-        self.hub.close()
-
-
-@pytest.fixture
-def served(monkeypatch):
-    # Not tmp_path: a socket name has at most 107 bytes.
-    with tempfile.TemporaryDirectory(prefix="xil", dir="/tmp") as directory:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", directory)
-        channel = ServedChannel("bus0")
-        yield channel
-        if channel.thread.is_alive():
-            channel.stop()
 
 
 @pytest.fixture(params=["virtual:link", "xilgate:bus0", "socketcan:vcan0"])
@@ -81,12 +50,12 @@ def test_frames_arrive_in_order_and_not_at_their_sender(bus_name):
         assert a.receive() == []
         b.send(frames[:1])
         assert receive(a, 1)[0].arbitration_id == 0x7FF
-        assert (a.is_alive, a.send_errors, a.receive_errors, a.ignored_frames) == (True, 0, 0, 0)
+        assert (a.health().state, a.unsent, a.ignored, a.refused_polls) == (BusState.ERROR_ACTIVE, {}, {}, 0)
 
 
 def test_frames_of_one_poll_carry_its_time_and_polls_go_forward(bus_name, monkeypatch):
     clock_ns = iter(range(1000, 10**9, 1000))
-    monkeypatch.setattr("dbc.link.time", SimpleNamespace(monotonic_ns=lambda: next(clock_ns)))  # the bus keeps its own clock
+    monkeypatch.setattr("dbc.can_link.time", SimpleNamespace(monotonic_ns=lambda: next(clock_ns)))  # the bus keeps its own clock
     with CanLink(bus_name) as a, CanLink(bus_name) as b:
         a.send([CanFrame(1, b"", 0)])
         (first,) = receive(b, 1)
@@ -103,15 +72,15 @@ def test_only_classical_data_frames_with_11_bits_pass(bus_name):
     if not bus_name.startswith("socketcan"):  # whose kernel keeps CAN FD from a classical socket, and makes error frames itself
         strange.append(can.Message(arbitration_id=0x110, is_extended_id=False, is_fd=True, data=bytes(12)))
     if bus_name.startswith("virtual"):  # the emulated bus lets nobody but the bus itself make error frames either
-        strange.append(can.Message(arbitration_id=0x040, is_extended_id=False, is_error_frame=True, data=bytes(8)))
+        strange.append(can.Message(arbitration_id=0x080, is_extended_id=False, is_error_frame=True, data=bytes(8)))
     settings = {"fd": True} if bus_name.startswith("xilgate") else {}
     with CanLink(bus_name) as link, python_can_bus(bus_name, **settings) as other:
         for message in strange:
             other.send(message)
         other.send(can.Message(arbitration_id=0x110, is_extended_id=False, data=b"ok"))
         assert [frame.data for frame in receive(link, 1)] == [b"ok"]
-        assert link.ignored_frames == len(strange)
-        assert link.is_alive
+        assert link.ignored == {"no classical data frame": len([one for one in strange if not one.is_error_frame])}
+        assert link.health().state is BusState.ERROR_ACTIVE
 
 
 def test_a_flood_does_not_hold_the_poll():
@@ -129,10 +98,11 @@ def test_a_hub_that_goes_is_visible_and_never_raises(served):
         receive(b, 3)
         served.stop()
         assert b.receive() == []
-        assert (b.is_alive, b.receive_errors) == (False, 1)
-        assert a.is_alive  # it has not looked yet
+        assert b.health().state is BusState.DOWN
+        assert a.health().state is BusState.ERROR_ACTIVE  # it has not looked yet
         a.send([CanFrame(3, b"", 0)] * 2)
-        assert (a.is_alive, a.send_errors) == (False, 2)
+        assert a.health().state is BusState.DOWN
+        assert a.unsent == {"refused": 1, "bus-off or down": 1}
 
 
 def test_frames_that_came_before_the_hub_went_are_still_delivered(served):
@@ -141,58 +111,7 @@ def test_frames_that_came_before_the_hub_went_are_still_delivered(served):
         receive(witness, 2)
         served.stop()
         assert [frame.arbitration_id for frame in b.receive()] == [1, 2]
-        assert not b.is_alive
-
-
-def test_a_refusal_that_passes_is_forgotten():
-    refusing = threading.Event()
-    with CanLink("virtual:refusal") as link:
-        accept = link._bus.send
-
-        def send(message):
-            if refusing.is_set():
-                raise can.CanOperationError("Failed to transmit: No buffer space available", 105)
-            accept(message)
-
-        link._bus.send = send
-        refusing.set()
-        link.send([CanFrame(1, b"", 0)])
-        assert (link.is_alive, link.send_errors) == (False, 1)
-        refusing.clear()
-        link.send([CanFrame(1, b"", 0)])
-        assert (link.is_alive, link.send_errors) == (True, 1)
-
-
-def refuse_once(link, error):
-    """The bus of a link fails at the next poll."""
-    deliver, refusals = link._bus.recv, [error]
-
-    def recv(timeout):
-        if refusals:
-            raise refusals.pop()
-        return deliver(timeout)
-
-    link._bus.recv = recv
-
-
-def test_an_interface_that_went_down_and_came_back_is_alive_again():
-    with CanLink("virtual:down") as link, CanLink("virtual:down") as other:
-        refuse_once(link, OSError(100, "Network is down"))
-        assert link.receive() == []
-        assert (link.is_alive, link.receive_errors) == (False, 1)
-        assert link.receive() == []
-        assert not link.is_alive  # silence proves nothing
-        other.send([CanFrame(1, b"", 0)])
-        assert len(link.receive()) == 1
-        assert link.is_alive
-
-
-def test_an_error_ahead_of_old_frames_hides_neither():
-    with CanLink("virtual:removed") as link, CanLink("virtual:removed") as other:
-        refuse_once(link, OSError(19, "No such device"))
-        other.send([CanFrame(1, b"", 0)])
-        assert len(link.receive()) == 1
-        assert (link.is_alive, link.receive_errors) == (False, 1)
+        assert b.health().state is BusState.DOWN
 
 
 @pytest.mark.parametrize("name", ["", "vcan0", "socketcan:", ":vcan0"])
@@ -256,7 +175,7 @@ def test_each_frame_travels_on_the_bus_of_its_message():
         assert ids(navigation.receive()) == [POS_LOCAL]
         assert ids(gateway.receive()) == [SR_COMMAND, UNKNOWN, SR_STATUS, POS_LOCAL]
         assert car.receive() == []
-        assert (gateway.dead, gateway.dropped) == ([], {})
+        assert (gateway.dead, gateway.dropped, car.unsent) == ([], {}, {})
 
 
 def test_a_message_on_the_wrong_bus_is_counted_and_not_heard():

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
-from dbc.packing import DecodeError, EncodeError, packing_of
+from dbc.packing import DecodeError, EncodeError, bits_of, packing_of, raw_range, value_range
 
 MESSAGES = [m for path in (ROBOTS_DBC, GNSS_IMU_DBC) for m in cantools.database.load_file(str(path)).messages]
 PLAIN = [message for message in MESSAGES if not message.is_multiplexed()]
+SHIFTS, CANTOOLS = "_Shifts", "_Cantools"
 PLAIN_SIGNALS = ("S : 4|3@1- (1,0) [-4|3]", "U : 7|1@1+ (2,-1) [-1|1]", "V : 8|8@1+ (1,0) [10|200]")
 STRANGE_SIGNALS = {
     "big endian": ("S : 7|16@0+ (0.5,0) [0|100]",),
@@ -19,9 +20,135 @@ STRANGE_SIGNALS = {
 }
 
 
-def message_of(*signals: str) -> cantools.database.can.message.Message:
-    text = 'VERSION ""\nBU_: A\nBO_ 1 X: 8 A\n' + "".join(f' SG_ {signal} "" A\n' for signal in signals)
-    return cantools.database.load_string(text, database_format="dbc").messages[0]
+def message_of(*signals, length=8, floats="") -> cantools.database.can.message.Message:
+    text = f'VERSION ""\nBU_: A\nBO_ 1 X: {length} A\n' + "".join(f' SG_ {signal} "" A\n' for signal in signals)
+    return cantools.database.load_string(text + floats, database_format="dbc").messages[0]
+
+
+@st.composite
+def layouts(draw):
+    """A message of some length, full of signals of one byte order or of both, side by side or apart."""
+    length = draw(st.integers(1, 8))
+    order = draw(st.sampled_from(["little", "big", "both"]))
+    signals, free = [], set(range(8 * length))
+    for index in range(draw(st.integers(1, 6))):
+        is_little = order == "little" or (order == "both" and draw(st.booleans()))
+        start, size = draw(st.integers(0, 8 * length - 1)), draw(st.integers(1, 24))
+        # Motorola bits follow each other in the order of transmission: of each byte the highest first.
+        bits = {start + bit if is_little else ((start ^ 7) + bit) ^ 7 for bit in range(size)}
+        if bits <= free:
+            free -= bits
+            sign, scale, offset = draw(st.sampled_from("+-")), draw(st.sampled_from(["1", "0.05", "-0.1", "3"])), draw(st.integers(-9, 9))
+            signals.append(f"S{index} : {start}|{size}@{int(is_little)}{sign} ({scale},{offset}) [0|0]")
+    return message_of(*signals, length=length), order
+
+
+@given(layouts(), st.data())
+@settings(max_examples=300, deadline=None)
+def test_every_layout_is_packed_and_read_as_cantools_does_it(layout, data):
+    message, order = layout
+    packing = packing_of(message)
+    assert order == "both" or type(packing).__name__ == SHIFTS
+    payload = data.draw(st.binary(min_size=message.length, max_size=message.length))
+    values = message.decode(payload, decode_choices=False)
+    assert packing.unpack(payload) == values
+    # What no signal has is zero when it is packed.
+    assert packing.pack(values) == bytes(message.encode(values, strict=False))
+    assert packing.unpack(packing.pack(values)) == values
+
+
+@pytest.mark.parametrize(
+    ("signals", "expected"),
+    [
+        (("A : 0|16@1+ (1,0) [0|0]", "B : 16|12@1+ (1,0) [0|0]"), SHIFTS),
+        (("A : 7|16@0+ (1,0) [0|0]", "B : 23|12@0+ (1,0) [0|0]"), SHIFTS),
+        (("A : 7|16@0+ (1,0) [0|0]", "B : 16|8@1+ (1,0) [0|0]"), SHIFTS),  # within a byte there is no order
+        (("A : 3|4@0+ (1,0) [0|0]", "B : 8|16@1+ (1,0) [0|0]"), SHIFTS),
+        (("A : 7|16@0+ (1,0) [0|0]", "B : 16|9@1+ (1,0) [0|0]"), CANTOOLS),
+        ((), SHIFTS),
+    ],
+)
+def test_one_byte_order_is_packed_by_shifts(signals, expected):
+    packing = packing_of(message_of(*signals))
+    assert type(packing).__name__ == expected
+    values = {signal.split()[0]: 5.0 for signal in signals}
+    assert packing.unpack(packing.pack(values)) == values
+
+
+def test_bits_of_a_signal_from_the_lowest_on():
+    intel, motorola = message_of("I : 6|4@1+ (1,0) [0|0]", "M : 17|4@0+ (1,0) [0|0]").signals
+    assert bits_of(intel) == [6, 7, 8, 9]
+    # Bits 1 and 0 of the third byte are the upper ones, bits 7 and 6 of the fourth the lower ones.
+    assert bits_of(motorola) == [30, 31, 16, 17]
+
+
+@pytest.mark.parametrize(
+    ("signal", "raw", "physical"),
+    [
+        ("S : 0|8@1+ (0.5,-3) [0|0]", (0, 255), (-3.0, 124.5)),
+        ("S : 0|8@1- (-0.5,1) [0|0]", (-128, 127), (-62.5, 65.0)),
+        ("S : 0|1@1+ (1,0) [0|0]", (0, 1), (0, 1)),
+        ("S : 0|1@1- (1,0) [0|0]", (-1, 0), (-1, 0)),
+    ],
+)
+def test_what_the_bits_can_hold(signal, raw, physical):
+    [read] = message_of(signal).signals
+    assert (raw_range(read), value_range(read)) == (raw, physical)
+
+
+FLOAT = "F : 0|32@1- (1,0) [0|0]"
+DOUBLE = "D : 7|64@0- (2,0) [0|0]"
+FLOATS = "SIG_VALTYPE_ 1 F : 1;\n"
+DOUBLES = "SIG_VALTYPE_ 1 D : 2;\n"
+
+
+def test_floats():
+    message = message_of(FLOAT, "S : 32|8@1+ (1,0) [0|9]", floats=FLOATS)
+    packing = packing_of(message)
+    for value in (0.0, -1.5, 3.4028234663852886e38, -3.4028234663852886e38, 1e-40):
+        payload = packing.pack({"F": value, "S": 9})
+        assert packing.unpack(payload) == message.decode(payload)
+        assert packing.unpack(payload)["F"] == pytest.approx(value)
+    # 1.5 is 0x3FC00000, IEEE 754.
+    assert packing.pack({"F": 1.5}).hex() == "0000c03f00000000"
+    for beyond in (math.nan, math.inf, -math.inf, 3.5e38, -3.5e38):
+        with pytest.raises(EncodeError, match=r"^X\.F = "):
+            packing.pack({"F": beyond})
+    for pattern in ("0000c07f", "0000807f", "000080ff"):  # not a number, infinity, minus infinity
+        with pytest.raises(DecodeError, match=r"^X\.F = "):
+            packing.unpack(bytes.fromhex(pattern + "00000000"))
+    assert packing.pack({"F": math.inf}, saturates=True) == packing.pack({"F": 3.4028234663852886e38})
+
+
+def test_doubles_and_the_range_of_floats():
+    packing = packing_of(message_of(DOUBLE, floats=DOUBLES))
+    # 0.75 at a scale of 2 is 0x3FD8000000000000 for 0.375, high byte first.
+    assert packing.pack({"D": 0.75}).hex() == "3fd8000000000000"
+    assert packing.unpack(packing.pack({"D": 1.7e308})) == {"D": 1.7e308}
+    with pytest.raises(DecodeError, match=r"^X\.D = inf"):
+        packing.unpack(bytes.fromhex("7fefffffffffffff"))  # the largest double, twice
+    ranged = packing_of(message_of(FLOAT.replace("[0|0]", "[-1|2]"), floats=FLOATS))
+    assert ranged.unpack(ranged.pack({"F": -1.0})) == {"F": -1.0}
+    for beyond in (-1.001, 2.001):
+        with pytest.raises(EncodeError, match=r"outside \[-1(\.0)?, 2(\.0)?\]$"):
+            ranged.pack({"F": beyond})
+    assert value_range(message_of(FLOAT.replace("|32@", "|16@"), floats=FLOATS).signals[0]) == (-65504.0, 65504.0)
+
+
+NESTED = ("M M : 0|4@1+ (1,0) [0|9]", "N m3M : 4|4@1+ (1,0) [0|9]", "A m7 : 8|8@1+ (1,0) [0|99]", "B m2 : 8|8@1+ (1,0) [0|99]")
+NESTING = "SG_MUL_VAL_ 1 N M 3-3;\nSG_MUL_VAL_ 1 A N 7-7;\nSG_MUL_VAL_ 1 B M 2-2;\n"
+
+
+def test_a_page_within_a_page_brings_both():
+    packing = packing_of(message_of(*NESTED, floats=NESTING))
+    assert packing.pack({"A": 5.0}).hex() == "7305000000000000"
+    assert packing.unpack(bytes.fromhex("7305000000000000")) == {"M": 3, "N": 7, "A": 5}
+    assert packing.pack({"B": 6.0}).hex() == "0206000000000000"
+
+
+def test_a_page_that_is_not_there_cannot_be_packed():
+    with pytest.raises(EncodeError, match=r"^X: .*multiplexer"):
+        packing_of(message_of(*STRANGE_SIGNALS["multiplexed"])).pack({"Page": 5.0})
 
 
 @given(data=st.data())

@@ -1,5 +1,6 @@
 """What the gateway believes of a command."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -59,6 +60,14 @@ def test_a_good_command_is_admitted():
         ({"t_ns": 0}, "time of another clock"),
         ({"plan_steer_rad": with_last(LEVEL, STEER_RANGE_RAD * 1.001)}, "steering out of range"),
         ({"plan_steer_rad": with_last(LEVEL, -STEER_RANGE_RAD * 1.001)}, "steering out of range"),
+        ({"plan_steer_rad": with_last(LEVEL, math.nan)}, "steering out of range"),
+        ({"steer_rad": math.nan}, "steering out of range"),
+        ({"steer_rad": 1.001 * STEER_RANGE_RAD}, "steering out of range"),
+        ({"plan_drive_norm": with_last(LEVEL, math.nan)}, "drive out of range"),
+        ({"drive_norm": math.nan}, "drive out of range"),
+        ({"drive_norm": -1.001 * DRIVE_RANGE_NORM}, "drive out of range"),
+        ({"lateral_error_m": math.nan}, "path error is no number"),
+        ({"heading_error_rad": math.inf}, "path error is no number"),
         ({"plan_drive_norm": with_last(LEVEL, DRIVE_RANGE_NORM * 1.001)}, "drive out of range"),
         ({"plan_drive_norm": with_last(LEVEL, -DRIVE_RANGE_NORM * 1.001)}, "drive out of range"),
     ],
@@ -113,6 +122,16 @@ def test_what_a_command_says_of_itself():
     degraded = replace(COMMAND, seq=2, status=CommandStatus.DEGRADED)
     gate.offer(NOW_NS, degraded, STATE_SEQ)
     assert (gate.status, gate.good_in_a_row, gate.newest) == (CommandStatus.DEGRADED, 0, degraded)
+    assert gate.degraded_in_a_row == 1
     assert gate.offer(NOW_NS + 3, replace(COMMAND, seq=3, status=CommandStatus.FAILED), STATE_SEQ)
     assert (gate.status, gate.good_in_a_row, gate.newest) == (CommandStatus.FAILED, 0, degraded)
     assert gate.age_ns(NOW_NS + 3) == 0
+    assert gate.degraded_in_a_row == 0
+    for k in range(4):
+        gate.offer(NOW_NS, replace(degraded, seq=4 + k), STATE_SEQ)
+    assert gate.degraded_in_a_row == 4
+    gate.offer(NOW_NS, replace(COMMAND, seq=9), STATE_SEQ)
+    assert (gate.degraded_in_a_row, gate.good_in_a_row) == (0, 1)
+    gate.offer(NOW_NS, replace(degraded, seq=10), STATE_SEQ)
+    gate.reset()
+    assert gate.degraded_in_a_row == 0

@@ -97,6 +97,11 @@ BEYOND = [
         {"commands": gate(status=CommandStatus.FAILED)},
         Finding(Cause.COMMAND_FAILED, 1, 0, "controller"),
     ),
+    (
+        {"commands": gate(degraded_in_a_row=3)},
+        {"commands": gate(degraded_in_a_row=4)},
+        Finding(Cause.COMMAND_FAILED, 4, 3, "controller (degraded)"),
+    ),
     (with_command_age(100 * MS), with_command_age(101 * MS), Finding(Cause.COMMAND_LOST, 101, 100, "controller")),
     (
         {"commands": gate(bad_in_a_row=1, last_cause="why")},
@@ -159,7 +164,7 @@ def test_what_was_observed_is_passed_on_once_what_concerns_the_state_as_such():
 @pytest.mark.parametrize(
     "cause",
     [
-        *(Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID, Cause.SPEED_IMPLAUSIBLE, Cause.POSITION_IMPLAUSIBLE),
+        *(Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID, Cause.FRAMES_LOST, Cause.SPEED_IMPLAUSIBLE, Cause.POSITION_IMPLAUSIBLE),
         *(Cause.YAW_RATE_IMPLAUSIBLE, Cause.STEERING_IMPLAUSIBLE),
     ],
 )

@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from dbc.frame import CanFrame
@@ -98,14 +98,16 @@ def test_hand_over_has_no_bump():
     drive = GatewayDrive()
     drive.car.steering_wheel_deg = 25.0
     drive.car.accelerator_percent = 25.0
+    drive.drive_norm = 0.25
     drive.engage()
     told = drive.car.told
     assert told["SR_Command"]["AngleCommand"] == pytest.approx(25.0, abs=8.1)  # one tick at 800 deg/s
-    assert told["AR_Command"]["PositionCommand"] == pytest.approx(25.0, abs=20.1)  # one tick of braking rate
+    assert told["AR_Command"]["PositionCommand"] == pytest.approx(25.0, abs=0.1)
 
 
 def test_command_reaches_the_robots_in_their_units():
     drive = GatewayDrive()
+    drive.car.is_following = True
     drive.engage()
     drive.steer_rad, drive.drive_norm = 0.05, 0.4
     drive.tick(50)
@@ -237,11 +239,12 @@ def test_heartbeat_every_100_ms():
     drives=st.lists(st.floats(-4.0, 4.0), min_size=5, max_size=30),
     vx_mps=st.floats(0.0, 36.0),
 )
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30, deadline=None, phases=(Phase.generate,))  # to shrink takes minutes
 def test_no_demand_ever_breaks_a_limit(steers, drives, vx_mps):
-    drive = GatewayDrive().engage()
+    drive = GatewayDrive()
     drive.car.vx_mps = round(vx_mps, 2)
-    drive.tick(60)
+    drive.car.is_following = True
+    drive.engage().tick(60)
     previous_deg = drive.car.told["SR_Command"]["AngleCommand"]
     for steer, drive_norm in zip(steers, drives, strict=False):
         drive.steer_rad, drive.drive_norm = steer, drive_norm

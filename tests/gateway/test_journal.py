@@ -5,6 +5,7 @@ import struct
 import tracemalloc
 import zlib
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -70,6 +71,9 @@ def test_a_step_comes_back_as_it_was():
 def test_equal_values_have_equal_bytes_whatever_the_order_of_what_has_none():
     assert pack_value({"b": 1, "a": frozenset({"x", "y"})}) == pack_value({"a": frozenset({"y", "x"}), "b": 1})
     assert pack_value(1) != pack_value(1.0)
+    assert pack_value(np.float64(0.1)) == pack_value(0.1)
+    with pytest.raises(NotImplementedError, match="object cannot be recorded"):
+        pack_value(object())
 
 
 @given(st.lists(st.binary(max_size=300), max_size=30))

@@ -1,9 +1,11 @@
 """The periodic loop, on a clock of our own."""
 
+import tracemalloc
+
 import pytest
 
 from gateway import loop as loop_module
-from gateway.loop import PeriodicLoop
+from gateway.loop import BUCKETS_NS, Histogram, PeriodicLoop
 
 MS = 1_000_000
 
@@ -55,3 +57,46 @@ def test_a_stall_is_skipped_and_counted_not_caught_up_with(clock):
     assert loop.wait() == 52 * MS
     assert loop.overruns == 2
     assert loop.wait() == 55 * MS
+
+
+def test_lateness_is_counted_in_its_bucket(clock):
+    loop = PeriodicLoop(10 * MS)
+    loop.wait()
+    clock.oversleep_ns = 4 * MS
+    loop.wait()
+    late = dict(zip([*BUCKETS_NS, None], loop.lateness.counts, strict=True))
+    assert late.pop(20_000) == 1
+    assert late.pop(5 * MS) == 1
+    assert set(late.values()) == {0}
+    assert (loop.lateness.sum_ns, loop.lateness.max_ns) == (4 * MS, 4 * MS)
+
+
+def test_a_sleep_that_ends_early_makes_no_second_tick(clock):
+    loop = PeriodicLoop(10 * MS)
+    clock.oversleep_ns = -1
+    assert loop.wait() == 15 * MS - 1
+    assert loop.wait() == 25 * MS
+    assert loop.overruns == 0
+
+
+def test_histogram_counts_every_duration_once():
+    histogram = Histogram()
+    durations = [0, 1, 20_000, 20_001, BUCKETS_NS[-1], BUCKETS_NS[-1] + 1, 10**12]
+    for duration_ns in durations:
+        histogram.observe(duration_ns)
+    assert sum(histogram.counts) == len(durations)
+    assert (histogram.counts[0], histogram.counts[1], histogram.counts[-2], histogram.counts[-1]) == (3, 1, 1, 2)
+    assert histogram.max_ns == 10**12
+
+
+def test_histogram_takes_no_memory_while_it_counts():
+    histogram = Histogram()
+    histogram.observe(3 * MS)
+    tracemalloc.start()
+    try:
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(10_000):
+            histogram.observe(3 * MS)
+        assert tracemalloc.get_traced_memory()[0] - before < 500
+    finally:
+        tracemalloc.stop()

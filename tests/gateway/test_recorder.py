@@ -27,6 +27,7 @@ from tests.support.recording_gateway import session, step
 EVERY_FORMAT = tuple(BusFormat)
 READERS = {"blf": can.BLFReader, "log": can.CanutilsLogReader, "asc": can.ASCReader}
 MAX_LOSS_S = 1.0
+S = 1_000_000_000
 WALL_NS = 1_700_000_000_000_000_000
 
 
@@ -359,9 +360,11 @@ def test_a_recorder_that_is_killed_is_noticed_and_costs_no_time(tmp_path, record
     feed(recorder, drive, 0.2)
     os.kill(recorder.pid, signal.SIGKILL)
     wait_until(lambda: not recorder.poll(time.monotonic_ns()).is_recording, 5, "the death of the recorder")
-    count, status = feed(recorder, drive, 0.2)
-    assert status.problem == "the recorder has ended"
-    assert status.lost >= count
+    before = recorder.poll(time.monotonic_ns()).lost
+    count, _ = feed(recorder, drive, 0.2)
+    status = recorder.poll(time.monotonic_ns() + S)
+    assert (status.problem, status.is_recording) == ("the recorder has ended", False)
+    assert status.lost - before == count
 
 
 def test_a_recorder_that_hangs_is_noticed_and_never_waited_for(recorder):

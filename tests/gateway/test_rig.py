@@ -131,21 +131,20 @@ def test_what_is_no_toml_is_one_line(rig_file, text):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(RigError, match="nowhere.toml: No such file"):
+    with pytest.raises(RigError, match=r"nowhere\.toml: No such file"):
         read_rig(tmp_path / "nowhere.toml")
 
 
 PLAIN = st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=8))
-TREES = st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3), max_leaves=8)
+TREES = st.recursive(PLAIN, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3))
 
 
 @settings(max_examples=300, deadline=None)
 @given(st.dictionaries(st.sampled_from([*Rig.model_fields, "x"]), TREES, max_size=6))
 def test_whatever_a_file_says_is_a_rig_or_a_mistake(tree):
-    try:
+    with pytest.raises(RigError) as caught:  # no tree that is made like this says all that a rig needs
         make_rig(Path("f"), tree, Path("/"))
-    except RigError as error:
-        assert all(line.startswith("f: ") for line in str(error).splitlines())
+    assert all(line.startswith("f: ") for line in str(caught.value).splitlines())
 
 
 # What the rig names.

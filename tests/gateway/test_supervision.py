@@ -1,12 +1,14 @@
 """Judgement on frames, and on those that are missing."""
 
+import random
+
 import pytest
 
 from dbc.catalogue import load
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from gateway.causes import Cause, Finding
-from gateway.supervision import MAX_BAD_FRAMES, RECOVERY_NS, WINDOW_FRAMES, Supervisor
+from gateway.supervision import MAX_BAD_FRAMES, MAX_LOST_FRAMES, RECOVERY_NS, WINDOW_FRAMES, Supervisor
 
 CATALOGUE = load()
 MS = 1_000_000
@@ -145,3 +147,63 @@ def test_a_second_sender_of_our_frames_is_named_once():
     assert watching.findings(0) == [Finding(Cause.SECOND_SENDER, 2, 0, "SR_Command")]
     assert watching.findings(0) == []
     assert watching.rejected == {"SR_Command: second sender": 2}
+
+
+class Traffic:
+    """Both buses as they should be, of which `keeps` decides what arrives."""
+
+    def __init__(self, *names):
+        self.watching = Supervisor(CATALOGUE, names)
+        self.senders = [Sender(name) for name in names]
+        self.now_ns = 0
+
+    def run(self, ticks, keeps):
+        causes_found = []
+        for _ in range(ticks):
+            self.now_ns += 10 * MS
+            sent = [sender.frame(self.now_ns) for sender in self.senders]
+            self.watching.observe([frame for k, frame in enumerate(sent) if keeps(k)])
+            causes_found += [finding for finding in self.watching.findings(self.now_ns) if finding.cause is Cause.FRAMES_LOST]
+        return causes_found
+
+
+FAST = ("SR_Status", "AR_Status", "BR_Status", "RC_SafetyStatus", "PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "MilliTime")
+
+
+@pytest.mark.req("F9")
+def test_losses_that_no_message_shows_by_itself_are_found_in_the_sum():
+    for seed in range(50):
+        dice = random.Random(seed)
+        traffic = Traffic(*FAST)
+        assert traffic.run(100, lambda _: True) == []
+        lossy = traffic.run(15, lambda _, dice=dice: dice.random() >= 0.25)
+        assert lossy
+        assert lossy[0].source == "buses"
+        assert lossy[0].value > lossy[0].limit
+
+
+@pytest.mark.req("F9")
+def test_one_per_cent_of_losses_is_ridden_out():
+    dice = random.Random(1)
+    assert Traffic(*FAST).run(6_000, lambda _: dice.random() >= 0.01) == []
+
+
+def test_the_exact_number_of_losses():
+    expected = 13 * len(FAST)
+    limit = len(FAST) + MAX_LOST_FRAMES
+    for lost in (limit, limit + 1):
+        traffic = Traffic(*FAST)
+        traffic.run(20, lambda _: True)
+        to_lose = iter(range(lost))
+        found = traffic.run(9, lambda _, to_lose=to_lose: next(to_lose, None) is None)
+        assert [(f.value, f.limit) for f in found[:1]] == (
+            [(pytest.approx(100 * lost / expected), pytest.approx(100 * limit / expected))] if lost > limit else []
+        )
+        traffic.run(13, lambda _: True)
+        assert traffic.run(1, lambda _: True) == []  # what was lost is forgotten after the window
+
+
+def test_a_short_time_says_nothing_and_slow_messages_are_not_counted():
+    traffic = Traffic(*FAST, "NcomStatus05") if "NcomStatus05" in CATALOGUE.by_name else Traffic(*FAST)
+    assert traffic.run(13, lambda _: False) == []
+    assert traffic.run(1, lambda _: False)

@@ -96,11 +96,7 @@ def test_process_with_an_open_reader_exits():
 # What comes from outside
 
 NESTED = [b"[" * depth for depth in (100, 10_000, 1_000_000)]
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(max_size=20),
-    lambda children: st.lists(children, max_size=4) | st.dictionaries(st.text(max_size=10), children, max_size=4),
-    max_leaves=12,
-)
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=20)
 
 
 @pytest.mark.req("S3", "F17")
@@ -113,7 +109,7 @@ def test_no_bytes_break_the_decoder(topic, payload):
 
 @pytest.mark.req("S3", "F17")
 @settings(max_examples=5_000, deadline=None)
-@given(st.sampled_from(list(msgspec.structs.asdict(WORLD))), JSON)
+@given(st.sampled_from(list(msgspec.structs.asdict(WORLD))), SCALARS | st.lists(SCALARS, max_size=3))
 def test_no_value_breaks_the_decoder(name, value):
     payload = json.dumps(msgspec.structs.asdict(WORLD) | {name: value}).encode()
     sample = decode("world", payload)
@@ -187,7 +183,7 @@ def test_a_flood_on_our_keys_neither_fills_memory_nor_stops_the_samples():
             flooder.kill()
             flooder.wait()
             flooder.stdout.close()
-    assert set(received) == {WORLD}
+    assert all(sample == WORLD for sample in received)
     assert asked == []
 
 
@@ -205,11 +201,17 @@ def test_a_request_that_is_too_long_is_refused_unread():
 # Who may connect
 
 
+def own_sockets(*protocols):
+    """Rows of the kernel's tables that belong to this process."""
+    descriptors = [Path("/proc/self/fd") / name for name in os.listdir("/proc/self/fd")]
+    own = {os.readlink(path) for path in descriptors if path.is_symlink()}
+    rows = [line.split() for name in protocols for line in Path("/proc/self/net", name).read_text().splitlines()[1:]]
+    return [row for row in rows if f"socket:[{row[9]}]" in own]
+
+
 def listening_addresses():
     """Local addresses of all listening TCP sockets of this process, as the kernel has them."""
-    inodes = {os.readlink(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd") if Path(f"/proc/self/fd/{name}").is_symlink()}
-    rows = [line.split() for name in ("tcp", "tcp6") for line in Path(f"/proc/self/net/{name}").read_text().splitlines()[1:]]
-    return {row[1].partition(":")[0] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in inodes}
+    return {row[1].partition(":")[0] for row in own_sockets("tcp", "tcp6") if row[3] == "0A"}
 
 
 @pytest.mark.req("S1")
@@ -217,9 +219,7 @@ def test_by_default_only_loopback_is_open_and_nothing_is_scouted():
     base = free_base_port()
     with Publisher(Source.GATEWAY, base), Subscriber(lambda topic, payload: None, ["state"], base):
         assert listening_addresses() == {"0100007F"}
-        udp = [line.split() for name in ("udp", "udp6") for line in Path(f"/proc/self/net/{name}").read_text().splitlines()[1:]]
-        inodes = {os.readlink(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd") if Path(f"/proc/self/fd/{name}").is_symlink()}
-        assert not [row for row in udp if f"socket:[{row[9]}]" in inodes]
+        assert own_sockets("udp", "udp6") == []
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +249,8 @@ def rig(certificates):
     with Publisher(Source.CONTROLLER, base, tls_of(certificates, "rig", tls_port)) as publisher:
         publisher.serve("parameters", lambda payload: asked.append(payload) or b"answer")
         heard = []
-        spy = publisher._session.declare_subscriber("xilgate/**", zenoh.handlers.Callback(lambda s: heard.append(str(s.key_expr)), indirect=False))
+        note = zenoh.handlers.Callback(lambda sample: heard.append(str(sample.key_expr)), indirect=False)
+        spy = publisher._session.declare_subscriber("xilgate/**", note)
         yield publisher, base, asked, heard, lambda name: tls_of(certificates, name, tls_port)
         spy.undeclare()
 
@@ -340,7 +341,7 @@ def test_a_rig_of_another_authority_is_not_believed(certificates, rig):
 @pytest.mark.req("S1")
 @pytest.mark.parametrize(
     "address",
-    ["tcp/192.168.1.10:7547", "tls/192.168.1.10:7547", "192.168.1.10", ":7547", "192.168.1.10:80", "192.168.1.10:65531", "host name:7547", ""],
+    ["tcp/192.168.1.10:7547", "tls/192.168.1.10:7547", "192.168.1.10", ":7547", "192.168.1.10:80", "192.168.1.10:65531", "a b:7547", ""],
 )
 def test_an_address_without_tls_or_port_is_refused_by_name(tmp_path, address):
     file = tmp_path / "tls.toml"

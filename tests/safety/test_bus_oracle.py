@@ -260,6 +260,14 @@ def _window():
     return script
 
 
+def _released():
+    script = Script().engage()
+    for percent in (*range(21), 0):
+        script.brake_percent = percent
+        script.tick()
+    return script
+
+
 def _stop(**options):
     def break_it():
         return Script().engage().stop(**options)
@@ -333,7 +341,7 @@ BROKEN = [
     ("lateral acceleration", _ramp("angle_deg", 0.2, 100)), ("lateral jerk", _ramp("angle_deg", 0.5, 1)),
     ("both pedals", engaged(drive_percent=1.0, brake_percent=1.0)),
     ("acceleration", _ramp("drive_percent", 1.0, 65)), ("deceleration", engaged(brake_percent=36.0)),
-    ("brake jerk", engaged(brake_percent=10.0)), ("drive jerk", engaged(drive_percent=20.0)),
+    ("brake jerk", engaged(brake_percent=10.0)), ("brake jerk", _released), ("drive jerk", engaged(drive_percent=20.0)),
     ("stop accelerates", _stop_with_accelerator), ("stop deceleration", _stop(until_mps2=3.0)), ("stop jerk", _stop(jerk_mps3=3.0)),
     ("stop too weak", _stop(until_mps2=0.5)), ("stop too weak", _stop(jerk_mps3=0.05)), ("stop too weak", _weak_safe_stop),
     ("standstill brake", _standstill), ("steering tail", _tail), ("comfort stop", _comfort),

@@ -36,7 +36,7 @@ _TICK_NS = 10 * MS
 _RATE_WINDOW_NS = 1_000 * MS
 _DEMAND_WINDOW_NS = 250 * MS  # panda's real-time window
 _SPEED_WINDOW_NS = 120 * MS  # age of a speed that the gateway may still rely on
-_STEER_LSB_DEG, _PEDAL_LSB_PERCENT = 0.05, 0.01
+_STEER_LSB_DEG, _PEDAL_LSB_PERCENT, _ACCELERATION_LSB_MPS2 = 0.05, 0.01, 0.01
 _NEUTRAL_MODES = ("Off", "Standby")
 _SILENT_NS = 30 * MS
 _UNSAFE = {Kind.STOP: ("Engage",), Kind.RELEASE: ("Engage", "Stop"), Kind.SILENCE: ("Engage", "Stop")}
@@ -114,8 +114,9 @@ class BusOracle:
         self._requests: dict[str, int] = {}
         self._now_ns = 0
         self._speeds: deque[tuple[int, float]] = deque()
-        self._question: tuple[int, int] | None = None
-        self._older_questions: deque[tuple[int, int]] = deque(maxlen=8)
+        self._felt_deceleration_mps2 = 0.0
+        self._question_counter = 0
+        self._questions: deque[tuple[int, int]] = deque(maxlen=8)
         self._commanded_ns = 0
         self._gap_until_ns = 0
         self._start()
@@ -131,6 +132,7 @@ class BusOracle:
         self._acceleration_mps2 = 0.0
         self._measurement_id: int | None = None
         self.status_mode = "Silent"
+        self._told_ns = 0
 
     def mark_fault(self, t_ns: int, fault: str) -> None:
         """A fault of the table begins at `t_ns`."""
@@ -150,6 +152,10 @@ class BusOracle:
     def mark_end(self, fault: str) -> None:
         """A fault to which no reaction is due is over."""
         self._pending = [pending for pending in self._pending if pending.fault != fault]
+
+    def mark_undone(self, t_ns: int) -> None:
+        """Faults that were to begin after `t_ns` do not."""
+        self._pending = [pending for pending in self._pending if pending.marked_ns <= t_ns]
 
     def mark_request(self, t_ns: int, operation: str) -> None:
         """The operator asks for `operation` ("ARM", "ENGAGE", "DISENGAGE", "STOP", "RESET")."""
@@ -185,16 +191,20 @@ class BusOracle:
             self._speeds.append((t_ns, abs(message.value(data, "VelForward"))))
             while self._speeds[0][0] < t_ns - _SPEED_WINDOW_NS and len(self._speeds) > 1:
                 self._speeds.popleft()
+        elif message.name == "AccelLevel":
+            self._felt_deceleration_mps2 = -message.value(data, "AccelForward")
         elif message.name == "RC_SafetyStatus" and message.data_id is not None and profile2_crc(data, message.data_id) == data[0]:
-            question = int(message.value(data, "WatchdogQuestion"))
-            if self._question is None or question != self._question[1]:
-                if self._question is not None:
-                    self._older_questions.append(self._question)
-                self._question = (t_ns, question)
+            step, self._question_counter = (counter_of(data) - self._question_counter) % 16, counter_of(data)
+            if 1 <= step <= 3:  # AUTOSAR profile 2: a receiver may lose two frames in a row
+                self._questions.append((t_ns, int(message.value(data, "WatchdogQuestion"))))
 
     def _speed_mps(self) -> float:
         """The smallest speed that the gateway may have relied on."""
         return min((speed for _, speed in self._speeds), default=0.0)
+
+    def _fastest_mps(self) -> float:
+        """The largest one."""
+        return max((speed for _, speed in self._speeds), default=0.0)
 
     # ---- what the gateway sends
 
@@ -239,6 +249,7 @@ class BusOracle:
             self._violate(t_ns, "authority", f"trajectory valid with request {request}")
         if authority != self.authority:
             self._judge_change(t_ns, authority)
+        is_continuous = t_ns - self._commanded_ns < 2 * _TICK_NS
         self._settle(t_ns, authority)
         if is_following and message.value(data, "CommandAge") > MAX_COMMAND_AGE_MS:
             self._violate(t_ns, "stale command", f"{message.value(data, 'CommandAge'):.0f} ms")
@@ -246,7 +257,7 @@ class BusOracle:
             self._violate(t_ns, "max speed", f"{message.value(data, 'MaxSpeed'):.0f} km/h")
         self._judge_watchdog(t_ns, int(message.value(data, "WatchdogAnswer")), authority)
         measurement_id = int(message.value(data, "MeasurementId"))
-        if self._is_lossless and self._measurement_id is not None and (measurement_id - self._measurement_id) % 16 > 1:
+        if self._is_lossless and is_continuous and self._measurement_id is not None and (measurement_id - self._measurement_id) % 16 > 1:
             self._violate(t_ns, "measurement id", f"{self._measurement_id} -> {measurement_id}")
         self._measurement_id = measurement_id
 
@@ -266,16 +277,17 @@ class BusOracle:
             if needed and not any(t_ns - self._requests.get(name, -(1 << 62)) <= REQUEST_WINDOW_NS + self._jitter_ns for name in needed):
                 self._violate(t_ns, "unasked", f"{before or 'silent'} -> {authority} without a request for it")
         if authority == "Stop":
-            self._entry_deceleration_mps2 = self._deceleration_mps2
+            # A car that brakes already goes on braking; it feels a little more than the pedal is asked for.
+            self._entry_deceleration_mps2 = max(self._deceleration_mps2, self._felt_deceleration_mps2 + _ACCELERATION_LSB_MPS2)
         if authority not in ("Engage", "Stop"):
             self._steer.clear()
         self.authority, self._entered_ns = authority, t_ns
 
     def _judge_watchdog(self, t_ns: int, answer: int, authority: str) -> None:
-        if self._question is None or authority not in ("Engage", "Stop"):
+        if not self._questions or authority not in ("Engage", "Stop"):
             return
-        live = [question for asked_ns, question in (*self._older_questions, self._question) if t_ns - asked_ns <= WATCHDOG_ANSWER_NS]
-        live = live or [self._question[1]]
+        live = [question for asked_ns, question in self._questions if t_ns - asked_ns <= WATCHDOG_ANSWER_NS]
+        live = live or [self._questions[-1][1]]
         if all(answer != ((question << 3 | question >> 5) & 0xFF) ^ 0xA7 for question in live):
             self._violate(t_ns, "watchdog", f"{answer} answers none of {live}")
 
@@ -329,7 +341,7 @@ class BusOracle:
         if abs(now_mps2 - was_mps2) > limits.lateral_jerk_mps3 * dt_s + lsb_mps2:
             self._violate(t_ns, "lateral jerk", f"{(now_mps2 - was_mps2) / dt_s:.2f} m/s3")
         if self.authority == "Stop" and previous_ns - self._entered_ns > PLAN_TAIL_NS + 200 * MS and abs(step_deg) > _STEER_LSB_DEG \
-                and abs(now_mps2) < 0.9 * limits.lateral_acceleration_mps2:
+                and self._fastest_mps() ** 2 * math.tan(math.radians(abs(angle_deg)) / car.steering_ratio) / car.wheelbase_m < 0.9 * limits.lateral_acceleration_mps2:
             self._violate(t_ns, "steering tail", f"{step_deg:.2f} deg in one frame after the end of any plan")
         self._steer.append((t_ns, angle_deg))
         while self._steer[0][0] < t_ns - _DEMAND_WINDOW_NS:
@@ -351,11 +363,12 @@ class BusOracle:
             self._violate(t_ns, "deceleration", f"{deceleration_mps2:.2f} m/s2")
         if self._pedals_ns:
             dt_s = max(t_ns - self._pedals_ns + self._jitter_ns, _TICK_NS) * 1e-9
-            rise_mps2 = acceleration_mps2 - deceleration_mps2 - (self._acceleration_mps2 - self._deceleration_mps2)
-            if acceleration_mps2 > self._acceleration_mps2 and rise_mps2 > limits.drive_jerk_mps3 * dt_s + lsb_mps2:
-                self._violate(t_ns, "drive jerk", f"{rise_mps2 / dt_s:.1f} m/s3")
-            if deceleration_mps2 > self._deceleration_mps2 and deceleration_mps2 - self._deceleration_mps2 > limits.brake_jerk_mps3 * dt_s + lsb_mps2:
-                self._violate(t_ns, "brake jerk", f"{(deceleration_mps2 - self._deceleration_mps2) / dt_s:.1f} m/s3")
+            pressed_mps2 = acceleration_mps2 - self._acceleration_mps2
+            if pressed_mps2 > limits.drive_jerk_mps3 * dt_s + lsb_mps2:
+                self._violate(t_ns, "drive jerk", f"{pressed_mps2 / dt_s:.1f} m/s3")
+            braked_mps2 = deceleration_mps2 - self._deceleration_mps2
+            if abs(braked_mps2) > limits.brake_jerk_mps3 * dt_s + lsb_mps2:
+                self._violate(t_ns, "brake jerk", f"{braked_mps2 / dt_s:.1f} m/s3")
             if self.authority == "Stop":
                 self._judge_stop(t_ns, deceleration_mps2, dt_s, lsb_mps2)
         self._pedals_ns, self._acceleration_mps2, self._deceleration_mps2 = t_ns, acceleration_mps2, deceleration_mps2
@@ -382,14 +395,17 @@ class BusOracle:
         """The mode that is told must be the mode that is acted; it is sent after the commands of its tick."""
         mode, cause = message.choice(data, "Mode"), message.choice(data, "Cause")
         expected = {
-            None: ("Silent", "Standby"), "None": ("Fault",), "Disarm": ("Standby", "Fault"), "Arm": ("Ready",), "Engage": ("Engaged",),
+            None: (), "None": ("Fault",), "Disarm": ("Standby", "Fault"), "Arm": ("Ready",), "Engage": ("Engaged",),
             "Stop": ("SafeStop", "ComfortStop"),
         }
-        if mode not in expected.get(self.authority, ()):
+        is_commanding = t_ns - self._commanded_ns <= self._jitter_ns  # in Fault nothing is commanded any more, not even to let go
+        if mode not in expected.get(self.authority, ()) and (is_commanding or mode != "Fault"):
             self._violate(t_ns, "status", f"mode {mode} while {self.authority}")
         if mode in ("SafeStop", "ComfortStop", "Fault") and cause == "None":
             self._violate(t_ns, "status", f"{mode} without a cause")
-        if mode == "SafeStop" and t_ns - self._entered_ns > 2_500 * MS and self._speed_mps() > 1.0:
+        if mode != self.status_mode:
+            self._told_ns = t_ns
+        if mode == "SafeStop" and t_ns - self._told_ns > 2_500 * MS and self._speed_mps() > 1.0:
             floor_mps2 = 0.9 * min(SAFE_STOP_MPS2, self._limits.deceleration_mps2)
             if self._deceleration_mps2 < floor_mps2:
                 self._violate(t_ns, "stop too weak", f"{self._deceleration_mps2:.2f} m/s2 in {mode}")

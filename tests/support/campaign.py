@@ -114,6 +114,7 @@ class World:
         self.replies: list[OperatorReply] = []
         self.gap_until_ns = 0
         self.is_deaf = False
+        self.around: dict[str, object] = {}
         self.watches: list[Callable[[World], bool]] = []
         self.least_severity = 0
         self.output: StepOutput | None = None
@@ -153,10 +154,14 @@ class World:
         """A fault to which no reaction is due is over."""
         self.oracle.mark_end(fault)
 
+    def lose_commands(self, from_ns: int) -> None:
+        """Commands that would arrive from then on do not; what was wrong with them has not happened."""
+        self.commands = [entry for entry in self.commands if entry[0] <= from_ns]
+        self.oracle.mark_undone(from_ns)
+
     def sleep(self, duration_ns: int) -> None:
         """The gateway's process does not run, from now on."""
-        self.gap_until_ns = self.now_ns + duration_ns
-        self.gap_until_ns -= (self.gap_until_ns - self.now_ns) % TICK_NS
+        self.gap_until_ns = max(self.gap_until_ns, self.now_ns + duration_ns // TICK_NS * TICK_NS)
         self.oracle.mark_gap(self.now_ns, self.gap_until_ns)
 
     def ask(self, operation: Operation) -> None:

@@ -11,7 +11,7 @@ from functools import cache
 
 from dbc.frame import CanFrame
 from dbc.health import BusState, LinkHealth
-from gateway.conditions import UNDISTURBED, Surroundings
+from gateway.conditions import Surroundings
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand
 from tests.support.campaign import MS, TICK_NS, Frames, Tap, World, catalogue
 from tests.support.oracle_wire import Wire, WireMessage, counter_of
@@ -142,7 +142,7 @@ def controller_dies(world: World) -> None:
     """Killed, stopped, hung or deadlocked: what it was computing never comes."""
     at_ns = random_time(world)
     world.controller.is_alive = False
-    world.commands = [entry for entry in world.commands if entry[0] <= at_ns]
+    world.lose_commands(at_ns)
     world.mark(at_ns, world.rng.choice(("F1", "F2")))
 
 
@@ -353,22 +353,25 @@ def disturbed(key: str | None, *taps: Tap) -> Callable[[World], None]:
     return inject
 
 
+def change_surroundings(world: World, at_ns: int, change: Callable[[int, Surroundings], Surroundings]) -> None:
+    """What the gateway's process tells its core changes from a time on; what was wrong before stays wrong."""
+    before = world.surroundings
+    world.surroundings = lambda now_ns: change(now_ns, before(now_ns)) if now_ns >= at_ns else before(now_ns)
+
+
 def bus_fails(state: BusState, network: str) -> Callable[[World], None]:
     """A bus is gone, bus-off, or takes no frames any more; then nothing comes from it either."""
 
     def inject(world: World) -> None:
         at_ns = random_time(world)
 
-        def surroundings(now_ns: int) -> Surroundings:
-            health = LinkHealth()
-            if now_ns >= at_ns and state is BusState.ERROR_ACTIVE:
-                health = LinkHealth(unconfirmed_ns=now_ns - at_ns)
-            elif now_ns >= at_ns:
-                health = LinkHealth(state=state, bus_offs=1, last_bus_off_ns=at_ns)
-            return Surroundings(links={network: health})
+        def health(now_ns: int) -> LinkHealth:
+            if state is BusState.ERROR_ACTIVE:
+                return LinkHealth(unconfirmed_ns=now_ns - at_ns)
+            return LinkHealth(state=state, bus_offs=1, last_bus_off_ns=at_ns)
 
-        world.surroundings = surroundings
-        world.is_deaf = network == "robots"
+        change_surroundings(world, at_ns, lambda now_ns, before: replace(before, links={**before.links, network: health(now_ns)}))
+        world.is_deaf = world.is_deaf or network == "robots"
         if world.rng.random() < 0.5:
             silent = [spec.name for spec in catalogue().by_name.values() if spec.network == network and spec.sender != "GW"]
             world.taps.append((at_ns, lose(silent)))
@@ -405,10 +408,12 @@ def babbling(world: World) -> None:
 
     world.taps.append((at_ns, flood))
     is_blocked = network == "robots"
-    world.surroundings = lambda now_ns: Surroundings(
-        links={network: LinkHealth(unconfirmed_ns=max(0, now_ns - at_ns) if is_blocked else 0)}
-    )
-    world.is_deaf = is_blocked
+    if is_blocked:
+        world.is_deaf = True
+        change_surroundings(
+            world, at_ns,
+            lambda now_ns, before: replace(before, links={**before.links, network: LinkHealth(unconfirmed_ns=now_ns - at_ns)}),
+        )
     world.mark(at_ns, "F11")
 
 
@@ -423,7 +428,7 @@ def tenfold(world: World) -> None:
         counter[0] += 10
         return [(t_ns + k * MS, frame._replace(data=message.sealed(frame.data, counter[0] + k))) for k in range(10)]
 
-    world.taps.append((random_time(world), tap))
+    world.taps.insert(0, (random_time(world), tap))  # the node itself does it, before anything else happens to its frames
 
 
 def gateway_dies(world: World) -> None:
@@ -442,8 +447,8 @@ def gateway_sleeps(world: World) -> None:
 def recorder_fails(world: World) -> None:
     """Disk full, read-only, or the recorder gone."""
     at_ns = random_time(world)
-    broken = world.rng.choice((Surroundings(is_recording=False), Surroundings(disk_free_share=0.0)))
-    world.surroundings = lambda now_ns: broken if now_ns >= at_ns else UNDISTURBED
+    broken = world.rng.choice(({"is_recording": False}, {"disk_free_share": 0.0}))
+    change_surroundings(world, at_ns, lambda now_ns, before: replace(before, **broken))
     world.mark(at_ns, "F15")
 
 
@@ -451,7 +456,7 @@ def junk_commands(world: World) -> None:
     """The controller's session is gone, and what comes instead is junk."""
     at_ns = random_time(world)
     kinds = list(BAD_COMMANDS.values())
-    world.commands = [entry for entry in world.commands if entry[0] <= at_ns]
+    world.lose_commands(at_ns)
     world.controller.spoil = lambda command: world.rng.choice(kinds)(command, world.rng)
     world.mark(at_ns, "F17")
 

@@ -29,7 +29,7 @@ class Envelope:
         steering_wheel_limit_deg, steering_wheel_rate_dps: of the steering-wheel demand [deg, deg/s]; the car's own end stop applies too.
         lateral_acceleration_mps2, lateral_jerk_mps3: of v^2 tan(road-wheel angle) / wheelbase, and of its change at constant speed.
         acceleration_mps2, deceleration_mps2: that the pedal demands stand for.
-        drive_jerk_mps3, brake_jerk_mps3: how fast the acceleration demand may rise, and how fast the brake may be pressed.
+        drive_jerk_mps3, brake_jerk_mps3: how fast the accelerator may be pressed, and the brake pressed or released.
         max_speed_kmh: largest value of GW_SafetyCommand.MaxSpeed.
     """
 
@@ -63,7 +63,7 @@ ENVELOPES = {
         lateral_jerk_mps3=200.0,  # profile
         acceleration_mps2=3.3,  # profile: full accelerator
         deceleration_mps2=10.0,  # profile: full brake
-        drive_jerk_mps3=16.0,  # profile
+        drive_jerk_mps3=20.0,  # profile: as fast as the accelerator robot
         brake_jerk_mps3=64.0,  # profile
         max_speed_kmh=130.0,
     ),
@@ -135,10 +135,10 @@ REACTIONS = {
     "F9": Reaction(Kind.STOP, 150 * MS, "B3 F9: 20 % lost or 120 ms late"),
     "F9 mild": Reaction(Kind.NONE, 0, "B3 F9: 1 % lost: no disengagement in 10 min"),
     "F9 any": Reaction(Kind.ANY, 0, "B3 F9: never a violation of a limit"),
-    "F10": Reaction(Kind.SILENCE, 60 * MS, "B3 F10: found in 50 ms; stop sending"),
+    "F10": Reaction(Kind.SILENCE, 60 * MS, "B3 F10: found in 50 ms; stop sending", 150 * MS),
     "F11": Reaction(Kind.STOP, 150 * MS, "B3 F11: own frames do not get through"),
     "F11 idle": Reaction(Kind.NONE, 0, "B3 F11: unknown identifiers that leave the bus its time"),
-    "F12": Reaction(Kind.SILENCE, 10 * MS, "B3 F12: the gateway is dead; the robots let go after 110 ms"),
+    "F12": Reaction(Kind.SILENCE, 10 * MS, "B3 F12: the gateway is dead; the robots let go after 110 ms", 40 * MS),
     "F13": Reaction(Kind.STOP, 0, "B3 F13: from waking; the first frame is safe"),
     "F14": Reaction(Kind.NONE, 0, "B3 F14: no effect"),
     "F15": Reaction(Kind.NONE, 0, "B3 F15: control unchanged"),

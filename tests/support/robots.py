@@ -43,6 +43,7 @@ class StubCar:
     selector: str = "D"
     system_state: str | None = None  # None: follow the gateway's request, as a robot controller does
     dead_man: int = 1
+    ready: int = 1
     override: int = 0
     fault: int = 0
     command_timeout: int = 0
@@ -124,7 +125,7 @@ class StubCar:
                 "EmergencyStopActive": self.emergency_stop,
                 "DeadManPressed": self.dead_man,
                 "DriverOverride": self.override,
-                "SrReady": 1, "ArReady": 1, "BrReady": 1,
+                "SrReady": self.ready, "ArReady": self.ready, "BrReady": self.ready,
                 "WatchdogQuestion": self._question,
                 "MeasurementId": safety.get("MeasurementId", 0) if self.is_echoing else 0,
             },

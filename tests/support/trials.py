@@ -1,6 +1,13 @@
-"""The campaign: which faults there are, and what one trial of one or two of them is."""
+"""The campaign: which faults there are, and what one trial of one or two of them is.
+
+    python -m tests.support.trials 'F6 a message missing' 17                             repeats one trial and prints what happened
+    python -m tests.support.trials 'F6 a message missing + F10 interface down' 17        of two faults
+"""
 
 import random
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 from dbc.health import BusState
@@ -40,7 +47,7 @@ FAULTS = (
     Fault("F8", "a speed frozen", f.frozen_while_braking, 1_500 * MS),
     Fault("F9", "1 % lost", f.disturbed("F9 mild", f.randomly(0.01, None, lambda t_ns, frame, rng: [])), 3_000 * MS),
     Fault("F9", "5 % lost", f.disturbed(None, f.randomly(0.05, None, lambda t_ns, frame, rng: []))),
-    Fault("F9", "20 % lost", f.disturbed(None, f.randomly(0.2, None, lambda t_ns, frame, rng: []))),
+    Fault("F9", "20 % lost", f.disturbed("F9", f.randomly(0.2, None, lambda t_ns, frame, rng: []))),
     Fault("F9", "duplicated", f.disturbed(None, f.randomly(0.2, None, lambda t_ns, frame, rng: [(t_ns, frame)] * 2))),
     Fault("F9", "reordered", f.disturbed(None, f.randomly(0.2, None, lambda t_ns, frame, rng: [(t_ns + rng.randrange(25 * MS), frame)]))),
     Fault("F9", "10 ms late", f.disturbed(None, f.late(10 * MS))),
@@ -93,11 +100,22 @@ def prepared(name: str, seed: int) -> World:
     return world
 
 
+@contextmanager
+def named(name: str, seed: int) -> Iterator[None]:
+    """An exception out of the gateway says which trial it was."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in trial {name!r}, seed {seed}")
+        raise
+
+
 def run(fault: Fault, seed: int) -> Trial:
     """Try one fault."""
     world = prepared(str(fault), seed)
-    fault.inject(world)
-    world.run(fault.duration_ns)
+    with named(str(fault), seed):
+        fault.inject(world)
+        world.run(fault.duration_ns)
     return Trial(str(fault), seed, world.oracle.finish(world.now_ns), world.oracle.reactions)
 
 
@@ -106,11 +124,12 @@ def run_pair(first: Fault, second: Fault, seed: int) -> Trial:
     name = f"{first} + {second}"
     world = prepared(name, seed)
     world.least_severity = severity(first, second)
-    first.inject(world)
-    for _ in range(world.rng.choice((0, 0, 1, 3, 7, 15))):
-        world.tick()
-    second.inject(world)
-    world.run(max(first.duration_ns, second.duration_ns))
+    with named(name, seed):
+        first.inject(world)
+        for _ in range(world.rng.choice((0, 0, 1, 3, 7, 15))):
+            world.tick()
+        second.inject(world)
+        world.run(max(first.duration_ns, second.duration_ns))
     return Trial(name, seed, world.oracle.finish(world.now_ns), world.oracle.reactions)
 
 
@@ -119,7 +138,27 @@ def severity(*chosen: Fault) -> int:
     return max(1, *(REACTIONS[fault.req].kind.severity for fault in chosen))
 
 
-def shares(trials: list[Trial]) -> str:
-    """Largest latency of the reactions in some trials, for people."""
-    latencies_ms = [answer.latency_ns / MS for trial in trials for answer in trial.reactions]
-    return f"n = {len(trials)}, slowest {max(latencies_ms):.1f} ms" if latencies_ms else f"n = {len(trials)}, no reaction due"
+def summary(name: str, trials: list[Trial]) -> str:
+    """One line about some trials, for people."""
+    allowed = {answer.fault: REACTIONS[answer.fault].within_ns / MS for trial in trials for answer in trial.reactions}
+    slowest = (
+        f"{fault} {max(a.latency_ns for t in trials for a in t.reactions if a.fault == fault) / MS:.1f} of {allowed_ms:.0f} ms"
+        for fault, allowed_ms in allowed.items()
+    )
+    bad = sum(bool(trial.violations) for trial in trials)
+    return f"{name}: {len(trials)} trials, {bad} with a violation; slowest: {', '.join(slowest) or 'no reaction due'}"
+
+
+def again(name: str, seed: int) -> Trial:
+    """The trial of this name and seed once more."""
+    chosen = [next(fault for fault in FAULTS if str(fault) == part) for part in name.split(" + ")]
+    return run(chosen[0], seed) if len(chosen) == 1 else run_pair(chosen[0], chosen[1], seed)
+
+
+if __name__ == "__main__":
+    trial = again(sys.argv[1], int(sys.argv[2]))
+    for violation in trial.violations:
+        print(f"{violation.t_ns * 1e-9:.4f} s  {violation.rule}: {violation.detail}")
+    for answer in trial.reactions:
+        print(f"{answer.fault}: first safe frame after {answer.latency_ns / MS:.1f} ms")
+    sys.exit(bool(trial.violations))

@@ -17,11 +17,12 @@ trap 'rm -rf "$WORK"' EXIT
 cat > "$WORK/init" <<'INIT'
 #!/bin/bash
 # First process of the guest. guest_work and guest_modules come from the kernel command line.
+export XILGATE_VCAN_GUEST=1      # for tests: here everything is there, and what is missing is a failure
 export PATH=/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin
 mount -t proc proc /proc; mount -t sysfs sys /sys
 mount -t tmpfs run /run; mkdir -p /dev/shm /dev/pts; mount -t tmpfs shm /dev/shm -o mode=1777; mount -t devpts pts /dev/pts
 ln -s /proc/self/fd /dev/fd 2>/dev/null
-for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/net/can/vcan; do
+for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/net/can/vcan drivers/net/can/slcan/slcan; do
   insmod "$guest_modules/$module.ko"
 done
 ip link set lo up

@@ -2,6 +2,7 @@
 
 import os
 import re
+from pathlib import Path
 
 import can
 import pytest
@@ -59,3 +60,19 @@ def test_a_record_without_duration_has_no_load(tmp_path, text):
     path = tmp_path / "bus.log"
     path.write_text(text)
     assert recorded_load(path, {"robots": 500_000}) == {}
+
+
+def test_what_was_heard_outlives_its_runner(tmp_path):
+    name = f"virtual:flush {os.getpid()}"
+    with BusListener([name], tmp_path / "bus.log"), CanLink(name) as node:
+        node.send([CanFrame(0x11, b"\x01", 0)])
+        # Long before the listener is closed, and far from a full buffer.
+        wait_until(lambda: (tmp_path / "bus.log").read_text().endswith(" 011#01\n"), 10, "the frame in the file")
+
+
+def test_a_full_disk_ends_the_record_and_is_told():
+    name = f"virtual:full {os.getpid()}"
+    with BusListener([name], Path("/dev/full")) as listener, CanLink(name) as node:
+        node.send([CanFrame(0x11, b"\x01", 0)])
+        wait_until(lambda: listener.problem, 10, "the refusal")
+    assert listener.problem == "the bus record ends early: No space left on device"

@@ -37,10 +37,12 @@ def test_unknown_navigation_bus(tmp_path, bus):
     fails(2, "--navigation-bus", bus, arguments=["drive", "--bus", "emulated", "--navigation-bus", bus, "--out", str(tmp_path)])
 
 
-@pytest.mark.parametrize("process", ["gateway", "emulator"])
-def test_a_daemon_names_the_bus_that_does_not_open(process):
+@pytest.mark.parametrize(
+    ("process", "exit_code", "said"), [("gateway", 2, "buses.robots = 'virtual'"), ("emulator", 3, "robots: bus 'virtual'")]
+)
+def test_a_daemon_names_the_bus_that_does_not_open(process, exit_code, said):
     port = ["--telemetry-port", str(free_base_port())]
-    fails(3, "robots: bus 'virtual'", arguments=[process, "--bus", "virtual", *port])
+    fails(exit_code, said, "INTERFACE:CHANNEL", arguments=[process, "--bus", "virtual", *port])
     fails(3, "navigation: bus 'xilgate:nobody'", arguments=[process, "--bus", "virtual:0", "--navigation-bus", "xilgate:nobody", *port])
 
 

@@ -40,6 +40,7 @@ def test_sil_drives_the_double_lane_change(sil):
         assert metric(summary, f"clearance in gate {gate}")["value"] > 0.0
     assert metric(summary, "disengagements before the end")["value"] == 0
     expected = {"summary.json", "report.html", "bus.log", "scenario.toml", "reference.csv", "road.toml", "configuration.json"}
+    expected |= {"gateway-0000.journal", "controller-0000.journal"}
     assert expected == {path.name for path in out.iterdir()}
 
 

@@ -12,6 +12,7 @@ from gateway.telemetry import StateSample, Subscriber, decode
 from tests.support.processes import children, end, free_base_port, is_running, start_xilgate, wait_until
 from tests.support.stall import StallProbe
 from vehicle_emulator.bus.channel import is_served
+from xil.resim import resim
 
 EVERYONE = {"bus", "gateway", "controller", "emulator"}
 
@@ -97,6 +98,9 @@ def test_the_double_lane_change_passes(tmp_path):
     assert summary["solver"] == "riccati"
     assert {"controller library", "robots.dbc", "gnss_imu.dbc", "configuration"} <= summary["sha256"].keys()
     assert (out / "bus.log").read_text().count("\n") > 20_000
+    # And again from what it recorded.
+    compared = [(comparison.of, comparison.different, comparison.missing) for comparison in resim(out, print)]
+    assert compared == [("gateway", 0, ""), ("controller", 0, "")]
 
 
 def test_a_killed_controller_stops_the_car_and_is_named(drive):

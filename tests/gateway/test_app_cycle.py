@@ -1,0 +1,165 @@
+"""The control cycle with a stub car: what it tells, how it ends, when it takes another configuration, and what it never does."""
+
+import logging
+from types import SimpleNamespace
+
+import pytest
+
+from gateway.housekeeping import Notice
+from gateway.messages import Mode, Operation
+from gateway.modes import Transition
+from gateway.recorder import RecorderStatus
+from gateway.telemetry import StatusSample
+from tests.support.cycle import CycleBench
+
+
+@pytest.fixture
+def bench():
+    return CycleBench()
+
+
+def transitions(bench):
+    return [(event.before, event.after) for event in bench.events() if isinstance(event, Transition)]
+
+
+def statuses(bench):
+    return [sample for sample in bench.samples if isinstance(sample, StatusSample)]
+
+
+def test_engagement_is_told_and_answered(bench):
+    bench.engage()
+    assert transitions(bench) == [(Mode.SILENT, Mode.READY), (Mode.READY, Mode.ENGAGED)]
+    assert [reply.refusals for reply in bench.replies] == [(), ()]
+    assert statuses(bench)[-1] is bench.pulse.status
+    assert bench.pulse.status.hashes == dict(bench.preparation.hashes)
+    assert bench.pulse.status.buses == {"robots": "error-active", "navigation": "error-active"}
+    assert bench.pulse.ticks == len(bench.states) == sum(bench.pulse.step_cpu.counts)
+
+
+@pytest.mark.req("E1")
+def test_end_in_silence_is_at_once_and_still_silent(bench):
+    bench.tick(50)
+    bench.orders.ends = 1
+    assert bench.tick(10) == 1
+    assert bench.frames == []
+
+
+def test_end_while_engaged_stops_the_car_first(bench):
+    bench.engage().orders.ends = 1
+    bench.tick(3_000)
+    assert bench.cycle.is_over
+    assert bench.mode is Mode.COMFORT_STOP
+    assert abs(bench.car.vx_mps) < 0.1
+    assert transitions(bench)[-1] == (Mode.ENGAGED, Mode.COMFORT_STOP)
+    assert len(bench.replies) == 2  # an operator is not told what he did not ask
+
+
+def test_end_at_speed_is_over_when_its_time_is():
+    bench = CycleBench(stop_within_s=2.0).engage()
+    bench.car.is_following = False
+    bench.orders.ends = 1
+    assert bench.tick(1_000) == 201
+    assert bench.cycle.is_over
+
+
+def test_second_request_to_end_is_obeyed_after_the_tick(bench):
+    bench.engage().orders.ends = 1
+    bench.tick(20)
+    assert not bench.cycle.is_over
+    sent = len(bench.frames)
+    bench.orders.ends = 2
+    assert bench.tick(10) == 1
+    assert len(bench.frames) > sent  # the tick was a whole one
+
+
+def test_end_when_ready_disarms_the_robots_first(bench):
+    bench.tick(210)
+    bench.ask(Operation.ARM)
+    bench.tick(2)
+    assert bench.mode is Mode.READY
+    bench.orders.ends = 1
+    assert bench.tick(100) < 20
+    assert bench.mode is Mode.STANDBY
+    requests = bench.preparation.catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
+    assert bench.car.told["GW_SafetyCommand"]["SystemRequest"] == requests["Disarm"]
+
+
+def test_an_operator_is_heard_while_the_process_ends(bench):
+    bench.engage().orders.ends = 1
+    bench.tick(1)
+    bench.ask(Operation.DISENGAGE)
+    bench.tick(1)
+    assert bench.mode is Mode.STANDBY
+
+
+def test_another_configuration_comes_in_force_where_nobody_drives(bench):
+    bench.tick(10)
+    bench.pulse.successor = successor = bench.preparation
+    assert bench.tick(5) == 1
+    assert bench.cycle.successor is successor
+
+
+@pytest.mark.req("S5")
+@pytest.mark.parametrize("is_engaged", [False, True])
+def test_another_configuration_is_refused_where_somebody_may_be_driven(bench, is_engaged):
+    if is_engaged:
+        bench.engage()
+    else:
+        bench.tick(210)
+        bench.ask(Operation.ARM)
+        bench.tick(2)
+    bench.events()
+    bench.pulse.successor = bench.preparation
+    assert bench.tick(5) == 5
+    assert bench.cycle.successor is bench.pulse.successor is None
+    (notice,) = bench.events()
+    assert isinstance(notice, Notice)
+    assert notice.text == f"reload refused: mode {bench.mode.name}"
+    assert notice.level == logging.WARNING
+
+
+def test_a_configuration_that_comes_while_the_process_ends_is_not_taken(bench):
+    bench.engage().orders.ends = 1
+    bench.pulse.successor = bench.preparation
+    bench.tick(3_000)
+    assert bench.cycle.is_over
+    assert bench.cycle.successor is None
+
+
+def test_a_reset_allows_the_buses_to_be_entered_again(bench):
+    bench.tick(10)
+    assert bench.buses.recoveries == 0
+    bench.ask(Operation.RESET)
+    bench.tick(2)
+    assert bench.buses.recoveries == 1
+
+
+def test_what_was_heard_and_answered_is_recorded_and_its_state_surrounds_the_core():
+    records = []
+    status = RecorderStatus(is_recording=False, disk_free_share=0.5, recorded=3, lost=2, problem="disk full")
+    bench = CycleBench(SimpleNamespace(poll=lambda _: status, record=lambda *record: records.append(record)))
+    bench.tick(210)
+    arguments, output = records[-1]
+    assert arguments.now_ns == bench.now_ns
+    assert output.state is bench.states[-1]
+    assert (arguments.surroundings.is_recording, arguments.surroundings.disk_free_share) == (False, 0.5)
+    assert (bench.pulse.status.ticks_unrecorded, bench.pulse.status.record_problem) == (2, "disk full")
+    assert any("record" in blocker for blocker in bench.pulse.status.blockers), bench.pulse.status.blockers
+
+
+def test_rejected_datagrams_are_told(bench):
+    bench.cycle._links.operators.rejected = 4
+    bench.tick(10)
+    assert bench.pulse.status.commands_rejected == {"no datagram of the operator's": 4}
+
+
+def test_the_control_thread_never_logs(bench, caplog):
+    with caplog.at_level(logging.DEBUG):
+        logging.getLogger("anybody").debug("the trap works")
+        bench.engage()
+        bench.car.fault = 1
+        bench.tick(100)
+        bench.orders.ends = 1
+        bench.tick(100)
+    assert Mode.SAFE_STOP in {after for _, after in transitions(bench)}
+    assert [record.msg for record in caplog.records] == ["the trap works"]

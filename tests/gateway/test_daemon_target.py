@@ -1,0 +1,120 @@
+"""What is installed on the target: the unit confines the gateway and gives it what it needs, the other files fit together."""
+
+import configparser
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from dbc.realtime import GATEWAY_PRIORITY
+from gateway.rig import Daemon, read_rig
+from xil.cli_common import EXIT_USER
+
+ROOT = Path(__file__).parents[2]
+TARGET = ROOT / "gateway" / "target"
+UNIT = TARGET / "xilgate-gateway.service"
+MAX_EXPOSURE = 21
+"""Of `systemd-analyze security`, in tenths; the scale ends at 100."""
+has_systemd = shutil.which("systemd-analyze") is not None
+
+
+def entries(path):
+    """All values of every key of a unit, by section and key."""
+    found = {}
+    section = ""
+    for line in path.read_text(encoding="ascii").splitlines():
+        if line.startswith("["):
+            section = line.strip("[]")
+        elif line and not line.startswith("#"):
+            key, _, value = line.partition("=")
+            found.setdefault((section, key), []).append(value)
+    return found
+
+
+SERVICE = {key: values for (section, key), values in entries(UNIT).items() if section == "Service"}
+
+
+def test_it_is_watched_and_started_again_unless_its_file_is_wrong():
+    assert SERVICE["Type"] == ["notify"]
+    assert SERVICE["WatchdogSec"] == ["1"]
+    assert SERVICE["Restart"] == ["on-failure"]
+    assert SERVICE["RestartPreventExitStatus"] == [str(EXIT_USER)]
+
+
+def test_a_reload_checks_the_file_before_it_asks_the_process():
+    check, ask = SERVICE["ExecReload"]
+    assert check == SERVICE["ExecStart"][0] + " --check"
+    assert ask == "/bin/kill -HUP $MAINPID"
+
+
+def test_systemd_waits_for_the_longest_stop_of_the_car():
+    with pytest.raises(ValueError, match="1 to 60"):
+        Daemon(stop_within_s=60.1)
+    assert int(SERVICE["TimeoutStopSec"][0]) > 60
+
+
+def test_real_time_by_limits_and_one_capability_for_the_bus():
+    assert SERVICE["LimitRTPRIO"] == [str(GATEWAY_PRIORITY)]
+    assert SERVICE["LimitMEMLOCK"] == ["infinity"]
+    assert SERVICE["CapabilityBoundingSet"] == SERVICE["AmbientCapabilities"] == ["CAP_NET_ADMIN"]
+    assert "RestrictRealtime" not in SERVICE
+
+
+@pytest.mark.req("S1")
+def test_it_is_confined():
+    for key in (
+        *("NoNewPrivileges", "PrivateTmp", "PrivateDevices", "ProtectClock", "ProtectControlGroups", "ProtectHome", "ProtectHostname"),
+        *("ProtectKernelLogs", "ProtectKernelModules", "ProtectKernelTunables", "RestrictNamespaces", "RestrictSUIDSGID"),
+        *("LockPersonality", "MemoryDenyWriteExecute"),
+    ):
+        assert SERVICE[key] == ["yes"], key
+    assert SERVICE["ProtectSystem"] == ["strict"]
+    assert SERVICE["User"] == ["xilgate"]
+    assert (SERVICE["IPAddressDeny"], SERVICE["IPAddressAllow"]) == (["any"], ["localhost"])
+    assert set(SERVICE["RestrictAddressFamilies"][0].split()) == {"AF_UNIX", "AF_CAN", "AF_INET", "AF_NETLINK"}
+    assert "ProcSubset" not in SERVICE  # it would hide the boot id, to which the key is bound
+
+
+@pytest.mark.skipif(not has_systemd, reason="no systemd-analyze")
+def test_systemd_reads_the_unit_without_a_word(tmp_path):
+    unit = tmp_path / UNIT.name
+    unit.write_text(UNIT.read_text().replace("/opt/xilgate/bin/xilgate", "/bin/true"))
+    finished = subprocess.run(["systemd-analyze", "verify", "--man=no", str(unit)], capture_output=True, text=True, timeout=60, check=False)
+    assert (finished.returncode, finished.stdout + finished.stderr) == (0, "")
+
+
+@pytest.mark.skipif(not has_systemd, reason="no systemd-analyze")
+def test_exposure_stays_low():
+    command = ["systemd-analyze", "security", "--no-pager", "--offline=true", f"--threshold={MAX_EXPOSURE}", str(UNIT)]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert finished.returncode == 0, finished.stdout.splitlines()[-1]
+
+
+def test_example_lies_where_the_unit_and_the_other_files_say():
+    example = read_rig(TARGET / "rig.toml")
+    runtime, state = SERVICE["RuntimeDirectory"][0], SERVICE["StateDirectory"][0]
+    assert example.control.directory == Path("/run") / runtime
+    assert example.recorder.directory == Path("/var/lib") / state / "records"
+    tmpfiles = (TARGET / "xilgate.tmpfiles.conf").read_text()
+    assert f"d {example.recorder.directory} 0750 xilgate xilgate" in tmpfiles
+    assert "z /etc/xilgate/rig.key 0640 root xilgate" in tmpfiles
+    assert example.realtime.priority <= int(SERVICE["LimitRTPRIO"][0])
+    assert str(example.metrics.port) in (ROOT / "docs" / "target.md").read_text()
+
+
+def test_the_bus_comes_up_with_the_bit_rate_of_the_dbc_and_no_restart_of_its_own():
+    network = configparser.ConfigParser()
+    network.optionxform = str
+    network.read(TARGET / "80-xilgate-can0.network")
+    assert network["CAN"]["BitRate"] == "500K"
+    assert "RestartSec" not in network["CAN"]
+
+
+def test_make_installs_every_file():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    recipe = re.search(r"^install-target:\n((?:\t.*\n)+)", makefile, re.M).group(1)
+    for path in TARGET.iterdir():
+        assert f"gateway/target/{path.name}" in recipe, path.name
+    assert "--require-hashes" in recipe
