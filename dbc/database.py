@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cantools
 from cantools.database.can.database import Database
+from cantools.database.can.formats.dbc import DbcSpecifics
 from cantools.database.can.message import Message
 from cantools.database.errors import Error as CantoolsError
 
@@ -77,18 +78,19 @@ def bitrates(files: Iterable[DbcFile]) -> dict[str, int]:
 
 def attributes_of(message: Message) -> dict[str, object]:
     """Attributes of a message by name, with the file's default where it has none of its own."""
-    if message.dbc is None:
-        return {}
-    stated: dict[str, object] = {name: definition.default_value for name, definition in message.dbc.attribute_definitions.items()}
-    return stated | {name: attribute.value for name, attribute in message.dbc.attributes.items()}
+    assert message.dbc is not None
+    return _stated(message.dbc)
+
+
+def _stated(of: DbcSpecifics) -> dict[str, object]:
+    defaults: dict[str, object] = {name: definition.default_value for name, definition in of.attribute_definitions.items()}
+    return defaults | {name: attribute.value for name, attribute in of.attributes.items()}
 
 
 def _network_of(path: Path, database: Database) -> tuple[str, int]:
     """The bus that a file is about, and its bit rate; a file that names none is about the robots' bus, as one for everything is."""
-    stated: dict[str, object] = {}
-    if database.dbc is not None:
-        stated = {name: definition.default_value for name, definition in database.dbc.attribute_definitions.items()}
-        stated |= {name: attribute.value for name, attribute in database.dbc.attributes.items()}
+    assert database.dbc is not None
+    stated = _stated(database.dbc)
     network, bitrate_bps = stated.get("BusName") or ROBOTS, stated.get("Baudrate") or _DEFAULT_BITRATE_BPS
     if not (isinstance(network, str) and network in NETWORKS):
         raise CatalogueError(f"{path}: BusName {network!r}: expected {' or '.join(NETWORKS)}")

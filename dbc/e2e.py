@@ -11,6 +11,7 @@ It detects faults, not attackers.
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
+from typing import NamedTuple
 
 from e2e.p02 import e2e_p02_check, e2e_p02_protect
 
@@ -98,7 +99,7 @@ class E2EReceiver:
 
     def check(self, payload: bytes) -> E2EStatus:
         """Judge a payload of at least two bytes."""
-        if not e2e_p02_check(payload, self._data_ids, length=0):
+        if not e2e_p02_check(payload, self._data_ids):
             return E2EStatus.WRONG_CRC
         counter = alive_counter(payload)
         previous, self._last_counter = self._last_counter, counter
@@ -139,6 +140,14 @@ class WindowRules:
     clean_ns: int = 1_000_000_000
 
 
+class _CleanRun(NamedTuple):
+    """Good frames in a row without a gap, up to the newest frame of all."""
+
+    since_ns: int
+    last_ns: int
+    frames: int
+
+
 class E2EWindow:
     """State machine over the frames of one message, good and bad (E2E_SM of AUTOSAR): Init, Valid, Invalid.
 
@@ -154,9 +163,7 @@ class E2EWindow:
         self._rules = rules
         self._mask = (1 << rules.size) - 1
         self._bad = 0  # one bit for each frame of the window, set for a bad one
-        self._good = 0
-        self._clean_since_ns = 0
-        self._last_good_ns = 0
+        self._run: _CleanRun | None = None
         self.state = E2EState.INIT
 
     def add(self, now_ns: int, is_good: bool) -> E2EState:
@@ -167,10 +174,7 @@ class E2EWindow:
             is_good: whether length, protection and ranges were as they must be.
         """
         self._bad = (self._bad << 1 | (not is_good)) & self._mask
-        if is_good:
-            self._note_good(now_ns)
-        else:
-            self._good = 0
+        self._run = self._longer_run(now_ns) if is_good else None
         if self.bad_frames > self._rules.max_bad:
             self.state = E2EState.INVALID
         elif self._is_trusted(now_ns):
@@ -182,13 +186,13 @@ class E2EWindow:
         """Bad frames in the window."""
         return self._bad.bit_count()
 
-    def _note_good(self, now_ns: int) -> None:
-        if self._good == 0 or now_ns - self._last_good_ns > self._timeout_ns:
-            self._good = 0
-            self._clean_since_ns = now_ns
-        self._good += 1
-        self._last_good_ns = now_ns
+    def _longer_run(self, now_ns: int) -> _CleanRun:
+        run = self._run
+        if run is None or now_ns - run.last_ns > self._timeout_ns:
+            return _CleanRun(now_ns, now_ns, 1)
+        return _CleanRun(run.since_ns, now_ns, run.frames + 1)
 
     def _is_trusted(self, now_ns: int) -> bool:
         wait_ns = self._rules.clean_ns if self.state is E2EState.INVALID else 0
-        return self._good >= self._rules.min_good and now_ns - self._clean_since_ns >= wait_ns
+        run = self._run
+        return run is not None and run.frames >= self._rules.min_good and now_ns - run.since_ns >= wait_ns

@@ -67,14 +67,14 @@ class Activation:
 class Actuation:
     """Limits demands and splits them; holds the last one, because rates are limited against it.
 
-    A plan is a staircase, and each of its steps becomes a ramp. So a rate counts as an activation only from the tick on in which the
-    demand has been behind for as long as a step of the plan lasts; a bound counts at once.
+    Every time a limit acts is counted. A plan is a staircase, and a rate makes a ramp of each of its steps; that a demand is held back
+    means more: a bound acts, or a rate has acted for as long as a step of the plan lasts.
 
     Attributes:
         demand: what the robots are asked for now.
         engaged_ticks: ticks in which demands were limited.
-        limited_ticks: those of them with an activation of any limit.
-        limited: activations by limit, see `UNITS`.
+        held_back_ticks: those of them in which a demand was held back; a controller with more than 1 % of them does not know its limits.
+        limited: ticks in which each limit acted, see `UNITS`.
         last_limited: the newest activation of each limit.
     """
 
@@ -90,9 +90,10 @@ class Actuation:
         self._drive_step_mps2 = self._resolution.pedal_norm * self._full_drive_mps2
         self._brake_step_mps2 = self._resolution.pedal_norm * self._full_brake_mps2
         self._behind: Counter[str] = Counter()
+        self._is_held_back = False
         self.demand = NEUTRAL
         self.engaged_ticks = 0
-        self.limited_ticks = 0
+        self.held_back_ticks = 0
         self.limited: Counter[str] = Counter()
         self.last_limited: dict[str, Activation] = {}
 
@@ -137,10 +138,10 @@ class Actuation:
 
     def _limit(self, steering_wheel_rad: float, acceleration_mps2: float, vx_mps: float, brake_norm: float) -> None:
         self.engaged_ticks += 1
-        counted = self.limited.total()
+        self._is_held_back = False
         limited_rad = self._limit_steering(steering_wheel_rad, abs(vx_mps)) * self._resolution.steering_wheel_rad
         self.demand = Demand(limited_rad, *self._limit_pedals(acceleration_mps2, brake_norm))
-        self.limited_ticks += min(self.limited.total() - counted, 1)
+        self.held_back_ticks += self._is_held_back
 
     def _limit_steering(self, asked_rad: float, speed_mps: float) -> int:
         """Steering-wheel angle in steps of the bus."""
@@ -216,9 +217,10 @@ class Actuation:
             self._behind[name] = 0
             return
         self._behind[name] += 1
+        self.limited[name] += 1
+        self.last_limited[name] = Activation(self.engaged_ticks, asked, limit, given)
         if name not in _RATES or self._behind[name] >= self._ramp_ticks:
-            self.limited[name] += 1
-            self.last_limited[name] = Activation(self.engaged_ticks, asked, limit, given)
+            self._is_held_back = True
 
 
 def _approach(before: int, target: int, low: float, high: float) -> int:

@@ -182,7 +182,7 @@ class Channel(_Socket):
     def _poll(self) -> None:
         for _ in range(MAX_DATAGRAMS_PER_POLL):
             try:
-                datagram = self._socket.recv(MAX_DATAGRAM_BYTES + 1)
+                datagram = self._socket.recv(MAX_DATAGRAM_BYTES)
             except BlockingIOError:
                 return
             except ConnectionError:  # the peer has chosen another one; what came since is still there
@@ -210,7 +210,7 @@ class OperatorServer(_Socket):
         """The oldest request that waits, or None; the others wait until they are asked for."""
         for _ in range(MAX_DATAGRAMS_PER_POLL):
             try:
-                datagram, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES + 1)
+                datagram, sender = self._socket.recvfrom(MAX_DATAGRAM_BYTES)
             except OSError:
                 return None
             message = unpack(datagram, self._key)
@@ -261,7 +261,7 @@ class OperatorClient(_Socket):
     def reply(self) -> OperatorReply | None:
         """The next answer that has arrived, or None."""
         try:
-            message = unpack(self._socket.recv(MAX_DATAGRAM_BYTES + 1), self._key)
+            message = unpack(self._socket.recv(MAX_DATAGRAM_BYTES), self._key)
         except OSError:
             return None
         return message if isinstance(message, OperatorReply) else None

@@ -87,7 +87,7 @@ class ControlCycle:
     def _answer(self, reply: OperatorReply) -> None:
         if reply.operation is Operation.RESET:  # a bus-off that is still there must not keep it from being left
             self._links.buses.recover()
-        if True:
+        if reply.boot_id != self._boot_id:
             self._links.operators.reply(reply)
 
     def _request(self, now_ns: int) -> OperatorRequest | None:

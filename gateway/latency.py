@@ -51,11 +51,9 @@ class LatencyChain:
         """The robots act on the command with this id; those before it they have passed over. Only the first echo counts."""
         if measurement_id not in self._awaited:
             return
-        state_t_ns = self._awaited[measurement_id]
-        for passed in list(self._awaited):
-            del self._awaited[passed]
-            if passed == measurement_id:
-                break
+        # In the order of their commands: what is before this one will not come any more.
+        while measurement_id in self._awaited:
+            state_t_ns = self._awaited.pop(next(iter(self._awaited)))
         self._measure(arrival_ns - state_t_ns)
 
     def _measure(self, age_ns: int) -> None:

@@ -31,7 +31,9 @@ def check(paths: Sequence[Path], mapping: Path | None, max_load: float) -> list[
 def timings(files: Sequence[DbcFile]) -> list[BusTiming]:
     """Load and worst-case response times of every bus that the files are about: no errors on the bus, no jitter."""
     analysed = []
-    for network, bitrate_bps in bitrates(files).items():
+    rates_bps = bitrates(files)
+    for network in dict.fromkeys(file.network for file in files):
+        bitrate_bps = rates_bps[network]
         cyclic = [timing for file in files if file.network == network for timing in _cyclic(file)]
         bounds_ns = {response.message.name: response.bound_ns for response in response_times(cyclic, bitrate_bps)}
         analysed.append(BusTiming(network, bus_load(cyclic, bitrate_bps)[1], bounds_ns))

@@ -4,8 +4,9 @@ import random
 
 import pytest
 
-from dbc.catalogue import ROBOTS_DBC, CatalogueError, EncodeError, load
+from dbc.catalogue import ROBOTS_DBC, CatalogueError, DecodeError, EncodeError, load
 from dbc.database import read_dbc
+from dbc.frame import CanFrame
 
 CATALOGUE = load()
 SITE_DBC = 'VERSION ""\nBU_: A\nBO_ 1 X: 8 A\n SG_ S : 0|8@1+ (1,0) [0|255] "" A\n'
@@ -51,6 +52,15 @@ def test_messages_that_are_needed_are_named():
     CATALOGUE.require(["SR_Command", "PosLocal"], "test")
     with pytest.raises(CatalogueError, match=r"^robots\.dbc, gnss_imu\.dbc: no message No, Nor, which the test needs$"):
         CATALOGUE.require(["No", "SR_Command", "Nor"], "test")
+
+
+def test_a_frame_is_read_when_its_length_fits():
+    spec = CATALOGUE.by_name["SR_Command"]
+    read = CATALOGUE.decode(spec, CanFrame(spec.arbitration_id, bytes.fromhex("0000fa0000000000"), 0))
+    assert (read["AngleCommand"], read["Enable"]) == (12.5, 0)
+    for length in (0, 7, 9):
+        with pytest.raises(DecodeError, match=rf"^SR_Command: {length} bytes, expected 8$"):
+            CATALOGUE.decode(spec, CanFrame(spec.arbitration_id, bytes(length), 0))
 
 
 def test_unknown_signal_is_named():

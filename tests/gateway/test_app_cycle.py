@@ -5,11 +5,13 @@ from types import SimpleNamespace
 
 import pytest
 
+from dbc.realtime import Grant
 from gateway.housekeeping import Notice
 from gateway.messages import Mode, Operation
 from gateway.modes import Transition
 from gateway.recorder import RecorderStatus
 from gateway.telemetry import StatusSample
+from gateway.warm_up import warm_up
 from tests.support.cycle import CycleBench
 
 
@@ -163,3 +165,16 @@ def test_the_control_thread_never_logs(bench, caplog):
         bench.tick(100)
     assert Mode.SAFE_STOP in {after for _, after in transitions(bench)}
     assert [record.msg for record in caplog.records] == ["the trap works"]
+
+
+def test_what_the_machine_refused_is_in_the_status():
+    bench = CycleBench(realtime={"priority": Grant("SCHED_FIFO 60", "no"), "memory": Grant("memory locked")})
+    bench.tick(10)
+    assert bench.pulse.status.realtime == {"priority": "SCHED_FIFO 60: refused, no", "memory": "memory locked"}
+
+
+@pytest.mark.req("E1")
+def test_warm_up_hears_everything_and_leaves_the_gateway_as_new(bench):
+    assert warm_up(bench.preparation) > 0
+    bench.tick(10)
+    assert (bench.mode, bench.pulse.ticks, bench.frames) == (Mode.SILENT, 10, [])

@@ -190,7 +190,7 @@ def test_one_poll_is_bounded(ends):
     real, gateway._socket = gateway._socket, endless
     assert gateway.newest(ControlCommand) == COMMAND
     gateway._socket = real
-    assert calls == [MAX_DATAGRAM_BYTES + 1] * MAX_DATAGRAMS_PER_POLL
+    assert calls == [MAX_DATAGRAM_BYTES] * MAX_DATAGRAMS_PER_POLL
 
 
 def flood(path, stop):
@@ -254,6 +254,7 @@ def test_each_operator_gets_his_own_answer(server, tmp_path):
         assert ann.ask(Operation.ARM).refusals == ("no command", "bus-off")
         assert bob.ask(Operation.ENGAGE).operation is Operation.ENGAGE
         assert ann.ask(Operation.RESET).operation is Operation.RESET
+        assert ann._socket.gettimeout() == 0.0  # who does not ask does not wait
         assert (ann.reply(), bob.reply()) == (None, None)
     assert [(request.seq, request.operation) for request in seen] == [(1, Operation.ARM), (1, Operation.ENGAGE), (2, Operation.RESET)]
     assert seen[0].boot_id == seen[2].boot_id != seen[1].boot_id

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from dbc.realtime import GATEWAY_PRIORITY
+from dbc.realtime import CONTROLLER_PRIORITY, GATEWAY_PRIORITY
 from gateway.rig import Daemon, read_rig
 from xil.cli_common import EXIT_USER
 
 ROOT = Path(__file__).parents[2]
 TARGET = ROOT / "gateway" / "target"
 UNIT = TARGET / "xilgate-gateway.service"
+CONTROLLER = TARGET / "xilgate-controller.service"
+UNITS = pytest.mark.parametrize("unit", [UNIT, CONTROLLER], ids=lambda path: path.stem)
 MAX_EXPOSURE = 21
 """Of `systemd-analyze security`, in tenths; the scale ends at 100."""
 has_systemd = shutil.which("systemd-analyze") is not None
@@ -33,7 +35,11 @@ def entries(path):
     return found
 
 
-SERVICE = {key: values for (section, key), values in entries(UNIT).items() if section == "Service"}
+def service(unit):
+    return {key: values for (section, key), values in entries(unit).items() if section == "Service"}
+
+
+SERVICE = service(UNIT)
 
 
 def test_it_is_watched_and_started_again_unless_its_file_is_wrong():
@@ -63,31 +69,42 @@ def test_real_time_by_limits_and_one_capability_for_the_bus():
 
 
 @pytest.mark.req("S1")
-def test_it_is_confined():
+@UNITS
+def test_it_is_confined(unit):
+    found = service(unit)
     for key in (
         *("NoNewPrivileges", "PrivateTmp", "PrivateDevices", "ProtectClock", "ProtectControlGroups", "ProtectHome", "ProtectHostname"),
         *("ProtectKernelLogs", "ProtectKernelModules", "ProtectKernelTunables", "RestrictNamespaces", "RestrictSUIDSGID"),
         *("LockPersonality", "MemoryDenyWriteExecute"),
     ):
-        assert SERVICE[key] == ["yes"], key
-    assert SERVICE["ProtectSystem"] == ["strict"]
-    assert SERVICE["User"] == ["xilgate"]
-    assert (SERVICE["IPAddressDeny"], SERVICE["IPAddressAllow"]) == (["any"], ["localhost"])
+        assert found[key] == ["yes"], key
+    assert found["ProtectSystem"] == ["strict"]
+    assert found["User"] == ["xilgate"]
+    assert (found["IPAddressDeny"], found["IPAddressAllow"]) == (["any"], ["localhost"])
+    assert "ProcSubset" not in found  # it would hide the boot id, to which the key is bound
+
+
+def test_only_the_gateway_has_the_bus():
     assert set(SERVICE["RestrictAddressFamilies"][0].split()) == {"AF_UNIX", "AF_CAN", "AF_INET", "AF_NETLINK"}
-    assert "ProcSubset" not in SERVICE  # it would hide the boot id, to which the key is bound
+    controller = service(CONTROLLER)
+    assert set(controller["RestrictAddressFamilies"][0].split()) == {"AF_UNIX", "AF_INET"}
+    assert controller["CapabilityBoundingSet"] == [""]
+    assert int(controller["LimitRTPRIO"][0]) == CONTROLLER_PRIORITY
 
 
 @pytest.mark.skipif(not has_systemd, reason="no systemd-analyze")
-def test_systemd_reads_the_unit_without_a_word(tmp_path):
-    unit = tmp_path / UNIT.name
-    unit.write_text(UNIT.read_text().replace("/opt/xilgate/bin/xilgate", "/bin/true"))
-    finished = subprocess.run(["systemd-analyze", "verify", "--man=no", str(unit)], capture_output=True, text=True, timeout=60, check=False)
+@UNITS
+def test_systemd_reads_the_unit_without_a_word(unit, tmp_path):
+    copy = tmp_path / unit.name
+    copy.write_text(unit.read_text().replace("/opt/xilgate/bin/xilgate", "/bin/true"))
+    finished = subprocess.run(["systemd-analyze", "verify", "--man=no", str(copy)], capture_output=True, text=True, timeout=60, check=False)
     assert (finished.returncode, finished.stdout + finished.stderr) == (0, "")
 
 
 @pytest.mark.skipif(not has_systemd, reason="no systemd-analyze")
-def test_exposure_stays_low():
-    command = ["systemd-analyze", "security", "--no-pager", "--offline=true", f"--threshold={MAX_EXPOSURE}", str(UNIT)]
+@UNITS
+def test_exposure_stays_low(unit):
+    command = ["systemd-analyze", "security", "--no-pager", "--offline=true", f"--threshold={MAX_EXPOSURE}", str(unit)]
     finished = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert finished.returncode == 0, finished.stdout.splitlines()[-1]
 

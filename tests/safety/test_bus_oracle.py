@@ -6,6 +6,7 @@ import random
 import cantools
 import pytest
 
+from gateway.limits import PROFILES
 from tests.support.bus_oracle import BusOracle
 from tests.support.oracle_limits import ENVELOPES, MS, REACTIONS, Kind
 from tests.support.oracle_wire import DBC_FILES, Wire, bit_positions, crc8h2f, profile2_crc, signal_reader
@@ -254,7 +255,7 @@ def _window():
     script.speed_mps = 0.0
     script.tick(20)
     for _ in range(30):
-        script.angle_deg += 3.5
+        script.angle_deg += 7.0
         script.now_ns += 2 * MS
         script.speak()
     return script
@@ -336,7 +337,7 @@ BROKEN = [
     ("authority", _half_engaged), ("authority", engaged(request="Arm", is_enabled=False)),
     ("stale command", engaged(age_ms=101.0)), ("max speed", engaged(max_speed_kmh=200.0)), ("watchdog", engaged(answer=0)),
     ("measurement id", engaged(measurement_id=2)),
-    ("steering angle", _ramp("angle_deg", 4.0, 120, speed_mps=0.0)), ("steering rate", _ramp("angle_deg", 4.2, 1, speed_mps=0.0)),
+    ("steering angle", _ramp("angle_deg", 4.0, 120, speed_mps=0.0)), ("steering rate", _ramp("angle_deg", 8.2, 1, speed_mps=0.0)),
     ("steering window", _window),
     ("lateral acceleration", _ramp("angle_deg", 0.2, 100)), ("lateral jerk", _ramp("angle_deg", 0.5, 1)),
     ("both pedals", engaged(drive_percent=1.0, brake_percent=1.0)),
@@ -462,5 +463,14 @@ def test_motorola_bits_are_read_as_the_dbc_counts_them():
     assert read(bytes([0xFF, 0xF8])) == -2 * 0.5 + 1.0
 
 
-def test_every_profile_has_an_envelope():
-    assert set(ENVELOPES) == {"nominal", "proving_ground", "bench"}
+@pytest.mark.parametrize("name", PROFILES)
+def test_the_limits_written_down_twice_are_the_same(name):
+    """A limit that is changed on purpose is changed in two places; the oracle never reads the product's."""
+    profile, envelope = PROFILES[name], ENVELOPES[name]
+    angle_deg = min(math.degrees(profile.steering_wheel_limit_rad), 463.3)
+    ours = (
+        angle_deg, math.degrees(profile.steering_wheel_rate_radps), profile.lateral_acceleration_mps2, profile.lateral_jerk_mps3,
+        profile.acceleration_mps2, profile.deceleration_mps2, profile.drive_jerk_mps3, profile.brake_jerk_mps3, 3.6 * profile.max_speed_mps,
+    )
+    assert ours == pytest.approx(tuple(vars(envelope).values()), rel=0.01)
+    assert set(ENVELOPES) == set(PROFILES)

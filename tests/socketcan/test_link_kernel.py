@@ -42,6 +42,13 @@ def wait_for(link: CanLink, state: BusState):
     wait_until(lambda: link.receive() or link.health().state is state, PATIENCE_S, f"the state {state.value}")
 
 
+def hear(link: CanLink | BusSet, count: int) -> list[CanFrame]:
+    """Frames until there are so many; the kernel delivers in its own time, if only microseconds later."""
+    frames = []
+    wait_until(lambda: frames.extend(link.receive()) or len(frames) >= count, PATIENCE_S, f"{count} frames")
+    return frames
+
+
 @pytest.mark.req("F11")
 def test_the_kernel_keeps_strangers_from_us(interface):
     # A port filters nothing itself: what it does not deliver, the kernel has kept.
@@ -52,7 +59,9 @@ def test_the_kernel_keeps_strangers_from_us(interface):
             other.send(raw_frame(identifier))
         for identifier in sorted(IDS):
             other.send(raw_frame(identifier))
-    assert [identifier for identifier, _, _ in everything.receive()[0]] == [*strange, *sorted(IDS)]
+    heard = []
+    wait_until(lambda: heard.extend(everything.receive()[0]) or len(heard) == len(strange) + len(IDS), PATIENCE_S, "all frames")
+    assert [identifier for identifier, _, _ in heard] == [*strange, *sorted(IDS)]
     assert port.receive() == ([(identifier, bytes(8), False) for identifier in sorted(IDS)], 0)
     port.close()
     everything.close()
@@ -62,7 +71,7 @@ def test_every_length_arrives_as_it_was_sent_and_in_order(interface):
     sent = [frame(SR_STATUS, bytes(range(length))) for length in range(9)] * 20  # more than one batch
     with CanLink(f"socketcan:{interface}", IDS) as link, CanLink(f"socketcan:{interface}") as other:
         other.send(sent)
-        assert [one._replace(t_ns=0) for one in link.receive()] == sent
+        assert [one._replace(t_ns=0) for one in hear(link, len(sent))] == sent
 
 
 def test_own_frames_confirm_and_another_programs_with_our_identifier_are_handed_on(interface):
@@ -71,18 +80,14 @@ def test_own_frames_confirm_and_another_programs_with_our_identifier_are_handed_
         link.send([frame(GW_SAFETY, b"ours")])
         assert link.health().unconfirmed_ns > 0
         other.send(raw_frame(GW_SAFETY, b"theirs"))
-        heard = []
-        wait_until(lambda: heard.extend(link.receive()) or heard, PATIENCE_S, "the other's frame")
-        assert [one.data for one in heard] == [b"theirs"]
+        assert [one.data for one in hear(link, 1)] == [b"theirs"]
         assert link.health() == WELL
 
 
 def test_a_second_sender_with_cansend_is_seen(interface):
     with BusSet(bus_names(f"socketcan:{interface}"), CATALOGUE, "GW") as gateway:
         subprocess.run(["cansend", interface, f"{SR_COMMAND:03X}#0011223344556677"], check=True)
-        heard = []
-        wait_until(lambda: heard.extend(gateway.receive()) or heard, PATIENCE_S, "the frame")
-        assert [(one.arbitration_id, one.data.hex()) for one in heard] == [(SR_COMMAND, "0011223344556677")]
+        assert [(one.arbitration_id, one.data.hex()) for one in hear(gateway, 1)] == [(SR_COMMAND, "0011223344556677")]
 
 
 def test_frames_that_were_not_read_in_time_are_counted(interface):
@@ -90,12 +95,9 @@ def test_frames_that_were_not_read_in_time_are_counted(interface):
         link.send([frame()])
         for _ in range(2_000):
             other.send(raw_frame(SR_STATUS))
-        heard = 0
-        while arrived := link.receive():
-            heard += len(arrived)
-        wait_until(lambda: link.receive() or link.lost, PATIENCE_S, "the count of lost frames")
-        assert heard + link.lost == 2_000
-        assert 400 < heard < 1_000  # half a second of a car's frames, no more: who sleeps for longer is better served with gaps
+        heard = []
+        wait_until(lambda: heard.extend(link.receive()) or len(heard) + link.lost == 2_000, PATIENCE_S, "every frame to be accounted for")
+        assert 400 < len(heard) < 1_000  # half a second of a car's frames, no more: who sleeps for longer is better served with gaps
         assert link.health().unconfirmed_ns == 0
 
 
@@ -136,9 +138,7 @@ def test_an_interface_that_is_removed_and_comes_back_filtered_as_before(interfac
         with raw_socket(interface) as other:
             other.send(raw_frame(STRANGERS[0]))
             other.send(raw_frame(SR_STATUS))
-            heard = []
-            wait_until(lambda: heard.extend(link.receive()) or heard, PATIENCE_S, "a frame")
-            assert [one.arbitration_id for one in heard] == [SR_STATUS]
+            assert [one.arbitration_id for one in hear(link, 1)] == [SR_STATUS]
             link.send([frame()])
             assert other.recv(16)[:4] == struct.pack("=I", SR_COMMAND)
 
@@ -157,7 +157,7 @@ def test_one_of_two_buses_goes_down(interface):
         wait_until(gateway.receive, PATIENCE_S, "the navigation frame")
 
 
-def test_the_users_restart_of_an_interface_that_has_none_is_refused_by_name(interface):
+def test_a_restart_that_an_interface_does_not_have_is_refused_by_name(interface):
     port = SocketCanPort(interface, IDS)
     assert port.refusal == ""
     port.restart()
@@ -178,9 +178,9 @@ def test_a_flood_holds_no_poll_and_no_memory(interface):
     with CanLink(f"socketcan:{interface}", IDS) as link:
         thread.start()
         try:
-            counts = [len(link.receive()) for _ in range(200)]
+            counts = []
+            wait_until(lambda: counts.append(len(link.receive())) or sum(counts) > 5_000, PATIENCE_S, "5,000 frames")
         finally:
             stop.set()
             thread.join()
         assert max(counts) <= 576  # a batch more than the limit, when the last one begins just below it
-        assert sum(counts) > 0

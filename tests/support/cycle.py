@@ -48,13 +48,14 @@ class StubBuses:
 class CycleBench:
     """A gateway's cycle and all around it; `tick` lets time pass."""
 
-    def __init__(self, recorder=None, **daemon):
+    def __init__(self, recorder=None, realtime=None, **daemon):
         self.preparation = prepare(make_rig(Path("test"), TREE | {"daemon": daemon}, Path("/")))
         self.car = StubCar(self.preparation.catalogue, is_following=True, vx_mps=5.0)
         self.now_ns = 1_000_000_000
         self.frames, self.states, self.replies, self.samples = [], [], [], []
         self.requests = deque()
         self.pulse, self.orders = Pulse(), Orders()
+        self.pulse.realtime = realtime or {}
         self.buses = StubBuses(self)
         links = Links(
             buses=self.buses,

@@ -105,6 +105,7 @@ CONDITIONS = {
     "bus passive": Condition(around(health=LinkHealth(state=BusState.ERROR_PASSIVE)), "error-passive"),
     "bus blocked": Condition(around(health=LinkHealth(unconfirmed_ns=51 * MS)), "get through", Grade.FAULT),
 }
+SILENT, TOLD_BY_CONTROLLER = "controller silent", ("controller degraded", "controller failed", "beside the path", "off in heading")
 _SAME = (("controller degraded", "controller failed"), ("bus passive", "bus blocked"))
 """Conditions that one switch sets to one value or the other."""
 
@@ -140,6 +141,8 @@ class Rules:
             self.bad[name] = self._tick
         else:
             del self.bad[name]
+        if name == SILENT:
+            self.bad |= {told: self._tick for told in TOLD_BY_CONTROLLER if told in self.bad}
 
     def restart(self) -> None:
         """The gateway's process begins anew and has to learn that all is good."""
@@ -181,7 +184,7 @@ class Rules:
 
     def _sure(self, name: str) -> bool:
         """Whether the gateway must know of a bad condition by now."""
-        return self._tick - self.bad[name] >= CONDITIONS[name].sure_ticks
+        return (SILENT not in self.bad or name not in TOLD_BY_CONTROLLER) and self._tick - self.bad[name] >= CONDITIONS[name].sure_ticks
 
     def _complain(self, what: str) -> None:
         self.complaints.append(f"tick {self._tick}, {self.world.mode.name}, bad {sorted(self.bad)}: {what}")

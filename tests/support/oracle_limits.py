@@ -47,7 +47,7 @@ class Envelope:
 ENVELOPES = {
     "nominal": Envelope(
         steering_wheel_limit_deg=463.3,  # end stop of the car: 0.55 rad at the road wheel, dbc/focus.toml
-        steering_wheel_rate_dps=401.1,  # docs/safety.md, profile: 7 rad/s
+        steering_wheel_rate_dps=796.5,  # profile: 13.9 rad/s, as proving_ground
         lateral_acceleration_mps2=3.0,  # ISO 11270, as panda has it; B2 computes the fault-tolerant time with it
         lateral_jerk_mps3=5.0,  # ISO 11270; B2
         acceleration_mps2=2.0,  # issue and B3, row G1

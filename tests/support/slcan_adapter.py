@@ -31,7 +31,12 @@ class SlcanAdapter:
         mode[0], mode[1], mode[3] = 0, 0, 0  # raw: no translation, no echo
         termios.tcsetattr(self._port, termios.TCSANOW, mode)
         os.set_blocking(self._firmware, False)
-        fcntl.ioctl(self._port, termios.TIOCSETD, struct.pack("i", _N_SLCAN))
+        try:
+            fcntl.ioctl(self._port, termios.TIOCSETD, struct.pack("i", _N_SLCAN))
+        except OSError:
+            os.close(self._firmware)
+            os.close(self._port)
+            raise
         self.interface = fcntl.ioctl(self._port, _SIOCGIFNAME, bytes(16)).partition(b"\0")[0].decode()
         self._unread = b""
         self._is_gone = False

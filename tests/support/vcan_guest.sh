@@ -26,11 +26,14 @@ for module in net/can/can net/can/can-raw drivers/net/can/dev/can-dev drivers/ne
   insmod "$guest_modules/$module.ko"
 done
 ip link set lo up
-for interface in vcan0 vcan1; do ip link add $interface type vcan && ip link set $interface up; done
+for interface in vcan0 vcan1; do ip link add $interface type vcan && ip link set $interface up || missing=$interface; done
 stty -F /dev/tty0 raw -echo
 mkfifo /run/output; cat /run/output > /dev/tty0 & reader=$!      # not a terminal, for what the command prints
-setsid bash "$guest_work/command" < /dev/null > /run/output 2>&1
-status=$?
+if [ -n "${missing-}" ]; then
+  echo "vcan_guest: no $missing in the guest" > /run/output; status=125
+else
+  setsid bash "$guest_work/command" < /dev/null > /run/output 2>&1; status=$?
+fi
 for _ in {1..40}; do kill -0 $reader 2>/dev/null || break; sleep 0.05; done
 echo $status > "$guest_work/status"
 sync; echo o > /proc/sysrq-trigger; sleep 9

@@ -13,7 +13,7 @@ from dbc.vehicle import FOCUS
 from tests.support.processes import end, free_base_port, start_xilgate, wait_until, xilgate
 from vehicle_emulator.bus.channel import is_served
 
-OPERATIONS = ("arm", "engage", "disengage", "stop", "reset")
+OPERATIONS = ("arm", "engage", "disengage", "stop")
 
 
 @pytest.fixture(scope="module")
