@@ -4,8 +4,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
+PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: setup run test test-socketcan lint bench clean lock install-target
+.PHONY: setup run test test-long test-socketcan lint bench clean lock install-target
 
 setup: $(VENV)/project.stamp
 	@set -- $$CC; for compiler in $$1 cc gcc clang; do \
@@ -17,7 +18,11 @@ run: setup
 	$(BIN)/xilgate drive
 
 test: setup $(VENV)/dev.stamp
-	$(BIN)/python -m pytest
+	$(PYTEST)
+
+# What takes minutes to hours; what it measured becomes docs/evidence.md.
+test-long: setup $(VENV)/dev.stamp
+	$(PYTEST) -m long --evidence
 
 # What needs a real SocketCAN interface; a machine whose kernel has no CAN runs it in a guest (Debian package user-mode-linux).
 test-socketcan: setup $(VENV)/dev.stamp

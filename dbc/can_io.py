@@ -57,6 +57,9 @@ class Port(Protocol):
     def restart(self) -> None:
         """Ask the controller to leave bus-off."""
 
+    def fileno(self) -> int:
+        """Descriptor that is readable when something has arrived; -1 when there is none."""
+
     def lost(self) -> int:
         """Frames lost since it was opened because they were not fetched in time."""
 
@@ -175,6 +178,9 @@ class SocketCanPort:
     def restart(self) -> None:  # noqa: D102
         self._watch.restart()
 
+    def fileno(self) -> int:  # noqa: D102
+        return self._socket.fileno()
+
     def lost(self) -> int:  # noqa: D102
         return int(_MEMINFO.unpack(self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size))[-1])
 
@@ -265,6 +271,12 @@ class PythonCanPort:
             self._bus.restart()
         except _REFUSALS as error:
             self.refusal = str(error)
+
+    def fileno(self) -> int:  # noqa: D102
+        try:
+            return self._bus.fileno()
+        except (*_REFUSALS, NotImplementedError):
+            return -1
 
     def lost(self) -> int:  # noqa: D102
         return 0

@@ -153,6 +153,10 @@ class CanLink:
         """Why the last attempt to leave bus-off was refused; empty when none was."""
         return self._port.refusal
 
+    def fileno(self) -> int:
+        """Descriptor that is readable when something has arrived; -1 when there is none. It changes when the bus is opened again."""
+        return self._port.fileno()
+
     def recover(self) -> None:
         """Allow all attempts to leave bus-off again; for the operator alone to ask for."""
         self._recovery.rearm(self._monitor.state, self._monitor.bus_offs)

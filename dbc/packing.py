@@ -7,7 +7,7 @@ cantools. A gateway packs and unpacks 1600 frames a second; a run in virtual tim
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal, NamedTuple, Protocol
 
 from cantools.database.can.message import Message
@@ -76,7 +76,8 @@ def value_range(signal: Signal) -> tuple[float, float]:
 def pages_of(message: Message, signal: Signal) -> dict[str, list[int]]:
     """The multiplexers that decide whether a signal is there, each with its values that bring it; none for one that always is."""
     pages: dict[str, list[int]] = {}
-    while signal.multiplexer_signal and signal.multiplexer_ids:
+    while signal.multiplexer_ids:
+        assert signal.multiplexer_signal is not None
         pages[signal.multiplexer_signal] = signal.multiplexer_ids
         signal = message.get_signal_by_name(signal.multiplexer_signal)
     return pages
@@ -127,9 +128,9 @@ def packing_of(message: Message) -> Packing:
     if not message.is_multiplexed() and not any(signal.is_float for signal in message.signals):
         orders: tuple[_WordOrder, ...] = ("little", "big")
         for order in orders:
-            shifts = [_shift(signal, message.length, order) for signal in message.signals]
-            if None not in shifts:
-                return _Shifts(message, order, [shift for shift in shifts if shift is not None])
+            shifts = {signal.name: _shift(signal, message.length, order) for signal in message.signals}
+            if None not in shifts.values():
+                return _Shifts(message, order, {name: shift for name, shift in shifts.items() if shift is not None})
     return _Cantools(message)
 
 
@@ -142,12 +143,12 @@ def _shift(signal: Signal, length_bytes: int, order: _WordOrder) -> int | None:
 
 
 class _Shifts:
-    def __init__(self, message: Message, order: _WordOrder, shifts: Sequence[int]) -> None:
+    def __init__(self, message: Message, order: _WordOrder, shifts: Mapping[str, int]) -> None:
         self._name = message.name
         self._length_bytes = message.length
         self._order = order
         fields = [Field.of(signal) for signal in message.signals]
-        placed = list(zip(fields, shifts, strict=True))
+        placed = [(field, shifts[field.name]) for field in fields]
         # Plain tuples: they unpack in a third of the time of named ones.
         self._unpacking = [(f.name, f.low, f.high, shift, f.mask, f.sign, f.scale, f.offset) for f, shift in placed]
         self._packing = {f.name: (f.low, f.high, shift, f.mask, ~(f.mask << shift), f.scale, f.offset) for f, shift in placed}

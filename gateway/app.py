@@ -1,6 +1,7 @@
 """The gateway process: the core between the car's buses, the controller's socket and telemetry, 100 times a second. Start here."""
 
 import contextlib
+import time
 from collections.abc import Callable
 
 from dbc.link import BusSet
@@ -9,8 +10,9 @@ from gateway.core import TICK_NS
 from gateway.cycle import ControlCycle, Links
 from gateway.housekeeping import Housekeeper, Orders, Pulse
 from gateway.logs import LogThread
-from gateway.loop import PeriodicLoop
+from gateway.loop import ArrivalWait
 from gateway.metrics import MetricsServer
+from gateway.pacing import Pacer
 from gateway.practice import realtime_practice
 from gateway.preparation import OWN_NODE, Preparation, start_recorder
 from gateway.systemd import Notifier
@@ -47,8 +49,10 @@ def run(
             opened.enter_context(MetricsServer(rig.metrics.port, pulse, logs))
         opened.enter_context(Housekeeper(pulse, orders, notifier, rig.daemon.watchdog_s, prepare))
         pulse.realtime = opened.enter_context(realtime_practice(rig.realtime))
-        cycle = ControlCycle(preparation, boot_id, Links(buses, channel, operators, telemetry, recorder), pulse, orders)
-        loop = PeriodicLoop(TICK_NS, pulse.lateness)
+        links = Links(buses, channel, operators, telemetry, recorder)
+        cycle = ControlCycle(preparation, boot_id, links, pulse, orders)
+        arrivals = ArrivalWait(links.filenos)
+        pacer = Pacer(time.monotonic_ns(), TICK_NS)
         while not cycle.is_over:
-            cycle.step(loop.wait(), loop.overruns)
+            cycle.look(arrivals.wait(pacer.deadline_ns), pacer)
     return cycle.successor

@@ -159,6 +159,10 @@ class Channel(_Socket):
             self._connect()
             self.unsent += not self._send(datagram)
 
+    def fileno(self) -> int:
+        """Descriptor that is readable when something has arrived."""
+        return self._socket.fileno()
+
     def newest(self, kind: type[T]) -> T | None:
         """The newest message of a kind that has arrived since it was last asked for, or None."""
         self._poll()

@@ -1,17 +1,19 @@
-"""What the control thread does 100 times a second. It waits for nobody, and what is slow it leaves to others (`housekeeping`)."""
+"""What the control thread does, 100 times a second and when something arrives; what is slow it leaves to others (`housekeeping`)."""
 
 import logging
 import time
 from dataclasses import dataclass
 
+from dbc.frame import CanFrame
 from dbc.link import BusSet
 from gateway.channel import Channel, OperatorServer
 from gateway.conditions import Surroundings
 from gateway.core import StepOutput
 from gateway.ending import Ending
 from gateway.housekeeping import QUIET, Notice, Orders, Pulse
-from gateway.journal import StepArguments
+from gateway.journal import Glance, StepArguments
 from gateway.messages import ControlCommand, Operation, OperatorReply, OperatorRequest
+from gateway.pacing import Pacer
 from gateway.preparation import Preparation
 from gateway.recorder import Recorder, RecorderStatus
 from gateway.samples import VIRTUAL, GatewaySampler, Process
@@ -34,6 +36,10 @@ class Links:
     telemetry: Publisher
     recorder: Recorder | None
 
+    def filenos(self) -> list[int]:
+        """Descriptors of what the control thread waits for."""
+        return [*self.buses.filenos(), self.channel.fileno()]
+
 
 class ControlCycle:
     """One gateway with its connections.
@@ -55,18 +61,41 @@ class ControlCycle:
         self._realtime = {name: str(grant) for name, grant in pulse.realtime.items()}
         self._record = NO_RECORD
         self._ending: Ending | None = None
+        self._command: ControlCommand | None = None
+        self._glances: list[Glance] = []
+        self._sent_seq = 0
         self.is_over = False
         self.successor: Preparation | None = None
 
-    def step(self, now_ns: int, overruns: int) -> None:
-        """One tick: hear, decide, speak; then tell whoever wants to know."""
+    def look(self, now_ns: int, pacer: Pacer) -> None:
+        """See what has arrived: a new state goes to the controller at once, and the step is taken when it is due."""
         cpu_start_ns = time.thread_time_ns()
+        frames, command = self._links.buses.receive(), self._links.channel.newest(ControlCommand)
+        if command is not None:
+            self._command = command
+            pacer.command_arrived(now_ns)
+        if pacer.is_due(now_ns, self._command is not None):
+            self._pulse.lateness.observe(max(now_ns - pacer.deadline_ns, 0))
+            pacer.stepped(now_ns)
+            self._step(now_ns, frames, pacer.overruns, cpu_start_ns)
+        elif frames:
+            self._glances.append(Glance(now_ns, frames))
+            if (state := self._core.sense(now_ns, frames)) is not None:
+                self._links.channel.send(state)
+                self._sent_seq = state.seq
+
+    def _step(self, now_ns: int, frames: list[CanFrame], overruns: int, cpu_start_ns: int) -> None:
+        """One tick: decide, speak; then tell whoever wants to know."""
         links = self._links
-        frames, command, request = links.buses.receive(), links.channel.newest(ControlCommand), self._request(now_ns)
-        arguments = StepArguments(now_ns, frames, command, request, self._surroundings(now_ns))
-        output = self._core.step(*arguments)
+        command, glances, request = self._command, self._glances, self._request(now_ns)
+        self._command, self._glances = None, []
+        surroundings = self._surroundings(now_ns)
+        output = self._core.step(now_ns, frames, command, request, surroundings)
         links.buses.send(output.frames)
-        links.channel.send(output.state)
+        if output.state.seq != self._sent_seq:
+            links.channel.send(output.state)
+            self._sent_seq = output.state.seq
+        arguments = StepArguments(now_ns, frames, command, request, surroundings, glances)
         if links.recorder is not None:
             links.recorder.record(arguments, output)
         if output.reply is not None:

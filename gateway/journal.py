@@ -20,7 +20,7 @@ from gateway.conditions import UNDISTURBED, Surroundings
 from gateway.messages import ControlCommand, OperatorRequest
 
 if TYPE_CHECKING:  # whoever keeps records does not need the core
-    from gateway.core import StepOutput
+    from gateway.core import GatewayCore, StepOutput
 
 FORMAT = 1
 """Number of the layout of blocks and sessions."""
@@ -42,14 +42,28 @@ class JournalError(UserMistake):
     """A journal cannot be read; one line that says where and why."""
 
 
+class Glance(NamedTuple):
+    """What `GatewayCore.sense` is called with."""
+
+    now_ns: int
+    frames: Sequence[CanFrame]
+
+
 class StepArguments(NamedTuple):
-    """What `GatewayCore.step` is called with: `core.step(*arguments)`."""
+    """What `GatewayCore.step` is called with, and `GatewayCore.sense` between the step before and this one."""
 
     now_ns: int
     frames: Sequence[CanFrame]
     command: ControlCommand | None = None
     request: OperatorRequest | None = None
     surroundings: Surroundings = UNDISTURBED
+    glances: Sequence[Glance] = ()
+
+    def step(self, core: "GatewayCore") -> "StepOutput":
+        """Let a core do it."""
+        for glance in self.glances:
+            core.sense(*glance)
+        return core.step(self.now_ns, self.frames, self.command, self.request, self.surroundings)
 
 
 class Session(msgspec.Struct, frozen=True, kw_only=True, tag_field="of"):

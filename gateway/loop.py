@@ -1,11 +1,16 @@
-"""The periodic loop of a real-time process: absolute deadlines, skipped rather than caught up with after a stall."""
+"""How a real-time process waits: for absolute deadlines, skipped rather than caught up with after a stall, and for what arrives."""
 
+import select
 import time
 from array import array
 from bisect import bisect_left
+from collections.abc import Callable
 
 BUCKETS_NS = tuple(bound_us * 1_000 for bound_us in (20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000))
 """Upper ends of the buckets of a histogram [ns]; what is longer falls into one more."""
+
+SPACING_NS = 500_000
+"""Shortest time between two wake-ups for what arrives [ns]: 2,000 frames/s, or a flood, must not mean as many wake-ups."""
 
 
 class Histogram:
@@ -26,6 +31,32 @@ class Histogram:
         self.counts[bisect_left(BUCKETS_NS, duration_ns)] += 1
         self.sum_ns += duration_ns
         self.max_ns = max(self.max_ns, duration_ns)
+
+
+class ArrivalWait:
+    """Sleeps until something has arrived, or a deadline has come.
+
+    Args:
+        filenos: gives the descriptors to watch, each time anew; those that are not usable are left out for that time.
+    """
+
+    def __init__(self, filenos: Callable[[], list[int]]) -> None:
+        self._filenos = filenos
+        self._last_ns = 0
+
+    def wait(self, deadline_ns: int) -> int:
+        """The monotonic time of the wake-up [ns]; never sooner than `SPACING_NS` after the one before."""
+        earliest_ns = min(self._last_ns + SPACING_NS, deadline_ns)
+        if (spare_ns := earliest_ns - time.monotonic_ns()) > 0:
+            time.sleep(spare_ns * 1e-9)
+        remaining_s = (deadline_ns - time.monotonic_ns()) * 1e-9
+        if remaining_s > 0.0:
+            try:
+                select.select(self._filenos(), [], [], remaining_s)
+            except (OSError, ValueError):  # a bus that has just gone
+                time.sleep(min(remaining_s, SPACING_NS * 1e-9))
+        self._last_ns = time.monotonic_ns()
+        return self._last_ns
 
 
 class PeriodicLoop:

@@ -158,7 +158,7 @@ class LockstepRun:
 
     def _step_gateway(self, now_ns: int) -> Ending | None:
         arguments = StepArguments(now_ns, self._to_gateway, self._command, self._request)
-        output = self._gateway.step(*arguments)
+        output = arguments.step(self._gateway)
         if self._journals is not None:
             self._journals.keep_step(arguments, output)
         self._to_gateway, self._command, self._request = [], None, None

@@ -165,7 +165,7 @@ def _resim_gateway(journal: Journal, progress: Progress) -> Comparison:
         step = unpack_step(record, f"{journal.name}: step")
         if not tally.is_next(step.seq, step.arguments.now_ns):
             break
-        output = core.step(*step.arguments)
+        output = step.arguments.step(core)
         tally.add(step.arguments.now_ns, len(step.sent), bytes(step.output), pack_value(output), partial(_in_output, catalogue))
     return tally.result()
 

@@ -28,6 +28,8 @@ from dbc.build import BuildError
 from dbc.errors import SetupFailure
 from dbc.vehicle import FOCUS
 
+pytestmark = pytest.mark.shared_setup
+
 OPTIONS = OcpOptions(integrator_steps=1)
 PER_SET = 4
 VECTORS = 3 * PER_SET + 1

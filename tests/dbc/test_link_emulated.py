@@ -109,6 +109,19 @@ def test_bus_off_ends_sending_and_recovery_is_our_own_and_limited(node, fast_rec
 
 
 @pytest.mark.req("F10")
+def test_nobody_but_the_link_of_a_node_ends_its_bus_off(served, monkeypatch):
+    monkeypatch.setattr("dbc.recovery.BUS_OFF_DELAYS_NS", (60 * 10**9,))
+    with CanLink(BUS, IDS) as ours, CanLink(BUS) as stand_in:
+        for link in (ours, stand_in):
+            link.disturb(SR_COMMAND, 32)
+            link.send([frame()])
+            wait_for(link, BusState.BUS_OFF)
+        wait_for(stand_in, BusState.ERROR_ACTIVE)  # by the hub, as any control unit of a car does by itself
+        ours.receive()
+        assert ours.health().state is BusState.BUS_OFF  # for longer already
+
+
+@pytest.mark.req("F10")
 def test_a_node_that_nobody_acknowledges_becomes_passive_and_piles_nothing_up(served):
     with CanLink(BUS, IDS) as link:
         for number in range(10):

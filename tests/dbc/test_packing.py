@@ -75,6 +75,51 @@ def test_one_byte_order_is_packed_by_shifts(signals, expected):
     assert packing.unpack(packing.pack(values)) == values
 
 
+START_DEFINITIONS = 'BA_DEF_ SG_ "GenSigStartValue" FLOAT 0 100000;\nBA_DEF_DEF_ "GenSigStartValue" 0;\n'
+STARTS = START_DEFINITIONS + 'BA_ "GenSigStartValue" SG_ 1 S 7;\nBA_ "GenSigStartValue" SG_ 1 T 0;\n'
+
+
+@pytest.mark.parametrize("last", ["U : 16|8@1+ (1,0) [0|255]", "U : 17|9@0+ (1,0) [0|511]"])
+def test_a_signal_that_is_not_given_has_its_start_value(last):
+    """Raw, as the attribute says it: 7 * 0.5 + 2 = 5.5, and 0 * 1 - 4 = -4, which is not the value nearest to zero; without one zero."""
+    signals = ("S : 0|8@1+ (0.5,2) [0|100]", "T : 8|8@1+ (1,-4) [-4|100]", last)
+    packing = packing_of(message_of(*signals, floats=STARTS))
+    assert packing.unpack(packing.pack({})) == {"S": 5.5, "T": -4.0, "U": 0.0}
+    assert packing.unpack(packing.pack({"S": 2.0})) == {"S": 2.0, "T": -4.0, "U": 0.0}
+    without = packing_of(message_of(*signals))
+    assert without.unpack(without.pack({})) == {"S": 2.0, "T": 0.0, "U": 0.0}
+
+
+def test_a_start_value_out_of_range_is_refused():
+    start = START_DEFINITIONS + 'BA_ "GenSigStartValue" SG_ 1 S 7;\n'
+    with pytest.raises(EncodeError, match=r"^X\.S = 5\.5 outside \[1\.7505, 5\.2495\]$"):
+        packing_of(message_of("S : 0|8@1+ (0.5,2) [0|5]", floats=start))
+
+
+@pytest.mark.parametrize("order", ["15|8@0+", "8|8@1+"])
+def test_what_rounds_into_the_range_is_in_it_to_the_last_digit(order):
+    packing = packing_of(message_of(f"V : {order} (1,0) [10.499|199.501]"))
+    for value, raw in ((10.0, 10), (200.0, 200)):
+        payload = bytes([0, raw, 0, 0, 0, 0, 0, 0])
+        assert packing.unpack(payload) == {"V": value}
+        assert packing.pack({"V": value}) == payload
+    for beyond in (math.nextafter(10.0, 0.0), math.nextafter(200.0, 300.0)):
+        with pytest.raises(EncodeError, match=rf"^X\.V = {beyond} outside \[10\.0, 200\.0\]$"):
+            packing.pack({"V": beyond})
+    for raw in (9, 201):
+        with pytest.raises(DecodeError, match=rf"^X\.V = {raw}(\.0)? outside \[10\.0, 200\.0\]$"):
+            packing.unpack(bytes([0, raw, 0, 0, 0, 0, 0, 0]))
+
+
+def test_table_entries_stay_numbers_in_every_packing():
+    table = 'VAL_ 1 Page 0 "First" 1 "Second" ;\nVAL_ 1 A 3 "Three" ;\n'
+    packing = packing_of(message_of(*STRANGE_SIGNALS["multiplexed"], floats=table))
+    assert packing.unpack(packing.pack({"A": 3.0})) == {"Page": 0, "A": 3}
+    assert all(isinstance(value, int) for value in packing.unpack(packing.pack({"A": 3.0})).values())
+    plain = packing_of(message_of("A : 8|8@1+ (1,0) [0|100]", floats='VAL_ 1 A 3 "Three" ;\n'))
+    assert plain.unpack(plain.pack({"A": 3.0})) == {"A": 3}
+
+
 def test_bits_of_a_signal_from_the_lowest_on():
     intel, motorola = message_of("I : 6|4@1+ (1,0) [0|0]", "M : 17|4@0+ (1,0) [0|0]").signals
     assert bits_of(intel) == [6, 7, 8, 9]

@@ -178,3 +178,30 @@ def test_warm_up_hears_everything_and_leaves_the_gateway_as_new(bench):
     assert warm_up(bench.preparation) > 0
     bench.tick(10)
     assert (bench.mode, bench.pulse.ticks, bench.frames) == (Mode.SILENT, 10, [])
+
+
+def test_a_state_is_sent_as_soon_as_the_navigation_data_are_new_and_not_again(bench):
+    bench.tick(5)
+    sent = len(bench.states)
+    bench.pacer.is_due = lambda now_ns, has_command: False
+    bench.tick()
+    assert len(bench.states) == sent + 1
+    assert bench.states[-1].t_ns == bench.now_ns
+    del bench.pacer.is_due
+    bench.cycle._links.buses.receive = list
+    bench.tick()
+    assert len(bench.states) == sent + 1  # the step has nothing newer to tell
+    bench.tick()
+    assert len(bench.states) == sent + 2  # but is not silent when nothing comes
+
+
+def test_a_command_that_came_between_two_steps_is_kept_for_the_next(bench):
+    bench.engage().tick(4)
+    admitted = bench.cycle._core.commands.newest
+    bench.pacer.is_due = lambda now_ns, has_command: False
+    while not bench.cycle._command:
+        bench.tick()
+    assert bench.cycle._core.commands.newest is admitted
+    del bench.pacer.is_due
+    bench.tick()
+    assert bench.cycle._core.commands.newest is not admitted

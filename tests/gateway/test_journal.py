@@ -15,6 +15,7 @@ from dbc.health import BusState, LinkHealth
 from gateway.conditions import Surroundings
 from gateway.journal import (
     MAX_RECORD_BYTES,
+    Glance,
     JournalError,
     JournalReader,
     StepArguments,
@@ -51,8 +52,10 @@ def steps(count):
         drive.now_ns += 10_000_000
         request = OperatorRequest(9, number, Operation.ARM, drive.now_ns) if number % 5 == 0 else None
         command = drive.command() if number % 4 == 0 else None
-        arguments = StepArguments(drive.now_ns, drive.car.speak(drive.now_ns), command, request, Surroundings(links, False, 0.25))
-        output = drive.core.step(*arguments)
+        early, late = (frames := drive.car.speak(drive.now_ns))[:5], frames[5:]
+        surroundings, glances = Surroundings(links, False, 0.25), [Glance(drive.now_ns - 1_000_000, early)]
+        arguments = StepArguments(drive.now_ns, late, command, request, surroundings, glances)
+        output = arguments.step(drive.core)
         drive.car.hear(output.frames)
         yield arguments, output
 

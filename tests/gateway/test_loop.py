@@ -1,11 +1,14 @@
 """The periodic loop, on a clock of our own."""
 
+import socket
+import time
 import tracemalloc
+from itertools import pairwise
 
 import pytest
 
 from gateway import loop as loop_module
-from gateway.loop import BUCKETS_NS, Histogram, PeriodicLoop
+from gateway.loop import BUCKETS_NS, SPACING_NS, ArrivalWait, Histogram, PeriodicLoop
 
 MS = 1_000_000
 
@@ -100,3 +103,30 @@ def test_histogram_takes_no_memory_while_it_counts():
         assert tracemalloc.get_traced_memory()[0] - before < 500
     finally:
         tracemalloc.stop()
+
+
+def test_it_wakes_up_for_what_arrives_or_at_the_deadline_and_not_too_often():
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        arrivals = ArrivalWait(lambda: [ours.fileno()])
+        start_ns = time.monotonic_ns()
+        assert arrivals.wait(start_ns + 20 * MS) >= start_ns + 20 * MS
+        theirs.send(b"x")
+        deadline_ns = time.monotonic_ns() + 60_000 * MS
+        wakes_ns = [arrivals.wait(deadline_ns) for _ in range(5)]  # nobody reads: it stays readable
+        assert wakes_ns[-1] < deadline_ns
+        assert min(after - before for before, after in pairwise(wakes_ns)) >= SPACING_NS
+
+
+def test_a_descriptor_that_has_gone_is_no_reason_to_fail_or_to_spin():
+    ours, theirs = socket.socketpair()
+    theirs.close()
+    gone = ours.fileno()
+    ours.close()
+    arrivals = ArrivalWait(lambda: [gone])
+    start_ns = time.monotonic_ns()
+    for _ in range(4):
+        arrivals.wait(start_ns + 1_000 * MS)
+    assert time.monotonic_ns() >= start_ns + 4 * SPACING_NS
+    no_number = ArrivalWait(lambda: [-1])
+    assert no_number.wait(time.monotonic_ns() + 60_000 * MS)

@@ -378,7 +378,7 @@ class BusOracle:
         if self._drive_percent > 0.0:
             self._violate(t_ns, "stop accelerates", f"{self._drive_percent:g} %")
         if self._speed_mps() < STANDING_MPS:
-            if self._brake_percent > STANDSTILL_BRAKE_PERCENT:
+            if self._brake_percent > STANDSTILL_BRAKE_PERCENT and deceleration_mps2 >= self._deceleration_mps2:
                 self._violate(t_ns, "standstill brake", f"{self._brake_percent:g} %")
             return
         ceiling_mps2 = max(SAFE_STOP_MPS2, self._entry_deceleration_mps2)

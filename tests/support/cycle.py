@@ -11,6 +11,7 @@ from gateway.core import TICK_NS
 from gateway.cycle import ControlCycle, Links
 from gateway.housekeeping import Orders, Pulse
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, Mode, Operation, OperatorRequest
+from gateway.pacing import Pacer
 from gateway.preparation import prepare
 from gateway.rig import make_rig
 from tests.support.robots import StubCar
@@ -21,6 +22,13 @@ TREE = {
     "buses": {"robots": "virtual:robots"},
     "car": {"dbc": [str(ROBOTS_DBC), str(GNSS_IMU_DBC)], "vehicle": str(FOCUS)},
 }
+
+
+class EveryTick(Pacer):
+    """Steps whenever it is asked, so that a tick of the bench is a step."""
+
+    def is_due(self, now_ns, has_command):
+        return True
 
 
 class StubBuses:
@@ -64,6 +72,7 @@ class CycleBench:
             telemetry=SimpleNamespace(post=self.samples.append),
             recorder=recorder,
         )
+        self.pacer = EveryTick(self.now_ns, TICK_NS)
         self.cycle = ControlCycle(self.preparation, 1, links, self.pulse, self.orders)
 
     @property
@@ -79,7 +88,7 @@ class CycleBench:
             if self.cycle.is_over:
                 return k
             self.now_ns += TICK_NS
-            self.cycle.step(self.now_ns, overruns=0)
+            self.cycle.look(self.now_ns, self.pacer)
         return count
 
     def engage(self):

@@ -227,12 +227,14 @@ class Rules:
     def _judge_staying(self, mode: Mode) -> None:
         sure = {name for name in self.bad if self._sure(name)}
         worst = max((CONDITIONS[name].grade for name in sure if CONDITIONS[name].grade is not Grade.DRIVER), default=Grade.BLOCKS)
-        has_driver = any(CONDITIONS[name].grade is Grade.DRIVER for name in sure)
+        drivers = [name for name in sure if CONDITIONS[name].grade is Grade.DRIVER]
+        # A stop that begins in the very tick in which the driver takes over ends in the next.
+        has_driver_settled = any(self._tick - self.bad[name] > 1 for name in drivers)
         forbidden = {
             Mode.READY: any(not CONDITIONS[name].is_for_engage_only for name in sure),
-            Mode.ENGAGED: worst > Grade.BLOCKS or has_driver,
-            Mode.COMFORT_STOP: worst >= Grade.SAFE or has_driver,
-            Mode.SAFE_STOP: worst >= Grade.FAULT or has_driver,
+            Mode.ENGAGED: worst > Grade.BLOCKS or bool(drivers),
+            Mode.COMFORT_STOP: worst >= Grade.SAFE or has_driver_settled,
+            Mode.SAFE_STOP: worst >= Grade.FAULT or has_driver_settled,
         }
         if forbidden.get(mode):
             self._complain(f"still {mode.name}")

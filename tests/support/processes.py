@@ -1,6 +1,7 @@
 """Runs the command line as its user would, and looks after its processes."""
 
-import os
+import functools
+import itertools
 import signal
 import socket
 import subprocess
@@ -8,14 +9,35 @@ import sys
 import time
 from pathlib import Path
 
-from gateway.telemetry import Source
+BLOCK, SPACING = 200, 10
+"""Ports of one process of tests; ports for one call, more than a run of all sources has."""
+
+
+@functools.cache
+def _ports() -> tuple[range, socket.socket]:
+    """A block of ports of this process alone: the kernel keeps the socket's name, and nobody else's, until the process ends."""
+    # Below the ports that Linux gives to outgoing connections.
+    for first in range(12_000, 32_000, BLOCK):
+        reservation = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            reservation.bind(f"\0xilgate test ports {first}")
+        except OSError:
+            reservation.close()
+            continue
+        return range(first, first + BLOCK, SPACING), reservation
+    raise RuntimeError("no free ports")
+
+
+_turns = itertools.count()
 
 
 def free_base_port() -> int:
-    """First of neighbouring loopback ports, one for each source, that are free now."""
-    for base in range(20000 + os.getpid() % 20000, 60000, 7):
+    """First of ten neighbouring loopback ports that are free now and that no other process of tests is given."""
+    bases, _ = _ports()
+    for _ in bases:
+        base = bases[next(_turns) % len(bases)]
         try:
-            for port in range(base, base + len(Source)):
+            for port in range(base, base + SPACING):
                 with socket.socket() as probe:
                     probe.bind(("127.0.0.1", port))
         except OSError:

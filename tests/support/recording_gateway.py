@@ -23,7 +23,7 @@ def session():
 def step(drive: GatewayDrive, now_ns: int) -> StepArguments:
     """One tick of the stub car and the gateway at this time; what the gateway was given."""
     arguments = StepArguments(now_ns, drive.car.speak(now_ns))
-    drive.output = drive.core.step(*arguments)
+    drive.output = arguments.step(drive.core)
     drive.car.hear(drive.output.frames)
     return arguments
 

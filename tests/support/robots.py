@@ -17,6 +17,7 @@ class StubCar:
 
     Attributes:
         is_following: whether the robots follow their commands and the car its robots; else speed and yaw rate are as they are set.
+        foot_percent: where the driver has the brake while the robots are not engaged; with `is_following` only.
         wheel_speed_offset_mps: error of the wheel-speed sensors.
         override_of: robots ("SR", "AR", "BR") at which the driver takes over.
         is_asking: whether the robot controller asks new watchdog questions.
@@ -31,6 +32,7 @@ class StubCar:
     steering_wheel_rate_dps: float = 0.0
     accelerator_percent: float = 0.0
     brake_percent: float = 0.0
+    foot_percent: float = 0.0
     acceleration_mps2: float = 0.0
     is_following: bool = False
     vy_mps: float = -0.5
@@ -97,7 +99,7 @@ class StubCar:
     def _follow(self, dt_s: float) -> None:
         """The robots follow their commands, and the car its robots."""
         lagging = 1.0 - math.exp(-dt_s / 0.03)
-        steering_deg, drive_percent, brake_percent = self.steering_wheel_deg, self.accelerator_percent, self.brake_percent
+        steering_deg, drive_percent, brake_percent = self.steering_wheel_deg, 0.0, self.foot_percent
         if self.is_engaged:
             steering_deg = self.told["SR_Command"]["AngleCommand"]
             drive_percent, brake_percent = (self.told[name]["PositionCommand"] for name in ("AR_Command", "BR_Command"))

@@ -1,5 +1,4 @@
 import gc
-import socket
 import threading
 import time
 
@@ -9,6 +8,7 @@ import pytest
 from dbc.catalogue import load
 from dbc.link import LinkError, bus_names
 from gateway import telemetry
+from tests.support.processes import free_base_port
 from vehicle_emulator import app
 from vehicle_emulator.app import EmulatorOptions, StepClock, world_sample
 from vehicle_emulator.emulator import STEP_NS, GroundTruth, StartPose
@@ -50,12 +50,6 @@ def test_world_sample_carries_the_truth_unchanged():
 def test_an_unknown_bus_is_refused_with_one_line():
     with pytest.raises(LinkError, match="nosuch:bus0"):
         app.run(EmulatorOptions(bus_names("nosuch:bus0")), threading.Event())
-
-
-def free_base_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1]) - 2
 
 
 @pytest.fixture

@@ -4,7 +4,6 @@ Run it to work on the page without a vehicle: `python -m tests.visualiser.feeder
 """
 
 import math
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -158,25 +157,6 @@ class Feeder:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def free_base_port() -> int:
-    """First of the free neighbouring ports, one per source."""
-    for first in range(20000, 30000, 7):
-        with ExitStack() as stack:
-            try:
-                for port in range(first, first + len(Source)):
-                    stack.enter_context(socket.socket()).bind(("127.0.0.1", port))
-            except OSError:
-                continue
-            return first
-    raise OSError("no neighbouring free ports")
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 @contextmanager

@@ -15,7 +15,8 @@ from aiohttp import ClientSession, ClientWebSocketResponse, WSServerHandshakeErr
 from aiohttp.test_utils import TestServer
 
 from gateway.telemetry import TOPICS
-from tests.visualiser.feeder import Feeder, free_base_port, free_port, running
+from tests.support.processes import free_base_port
+from tests.visualiser.feeder import Feeder, running
 from tests.visualiser.test_board import encoded
 from visualiser import bridge as bridge_module
 from visualiser.bridge import Bridge, ViewError, ViewOptions, run
@@ -171,7 +172,7 @@ def test_a_port_out_of_range_is_one_clear_line(port: int) -> None:
 
 
 def test_live_samples_reach_a_browser_and_the_view_ends_with_one_still_attached() -> None:
-    base_port, port, stop = free_base_port(), free_port(), threading.Event()
+    base_port, port, stop = free_base_port(), free_base_port(), threading.Event()
     options = ViewOptions(port, base_port)
 
     async def look() -> None:

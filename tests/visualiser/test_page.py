@@ -7,8 +7,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from tests.support.processes import free_base_port
 from tests.visualiser.browser import Page, find_chromium, open_page
-from tests.visualiser.feeder import Feeder, free_base_port, free_port, running
+from tests.visualiser.feeder import Feeder, running
 from visualiser.bridge import ViewOptions, run
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -68,7 +69,7 @@ async def _look(base_port: int, port: int, picture: Path) -> None:
 
 def test_the_page_shows_the_drive_and_says_when_the_link_is_lost(tmp_path: Path) -> None:
     find_chromium()
-    base_port, port, stop = free_base_port(), free_port(), threading.Event()
+    base_port, port, stop = free_base_port(), free_base_port(), threading.Event()
     with running(threading.Thread(target=run, args=(ViewOptions(port, base_port), stop)), stop):
         asyncio.run(_look(base_port, port, tmp_path / "view.png"))
 

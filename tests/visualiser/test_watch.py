@@ -8,7 +8,8 @@ import time
 import pytest
 from rich.console import Console
 
-from tests.visualiser.feeder import Feeder, free_base_port, running
+from tests.support.processes import free_base_port
+from tests.visualiser.feeder import Feeder, running
 from tests.visualiser.test_board import encoded
 from visualiser.board import Board
 from visualiser.watch import WatchOptions, line, run, table

@@ -12,6 +12,8 @@ from vehicle_emulator.bus.bits import frame_bits
 from vehicle_emulator.bus.frame import BusFrame
 from xil.buslog import recorded_load
 
+pytestmark = pytest.mark.shared_setup
+
 MAX_RESPONSE_US = 10_000
 """Longest time that a message of the default set can take on its bus, rounded up to the shortest cycle."""
 

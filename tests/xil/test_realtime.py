@@ -14,6 +14,8 @@ from tests.support.stall import StallProbe
 from vehicle_emulator.bus.channel import is_served
 from xil.resim import resim
 
+pytestmark = pytest.mark.realtime
+
 EVERYONE = {"bus", "gateway", "controller", "emulator"}
 
 
@@ -56,18 +58,14 @@ class Drive:
 
 
 @pytest.fixture
-def drive(tmp_path):
-    running = Drive(tmp_path)
+def drive(tmp_path, request):
+    running = Drive(tmp_path, getattr(request, "param", "iso3888-1"))
     yield running
     running.close()
 
 
 def is_engaged(state):
     return state.mode == "ENGAGED"
-
-
-def in_manoeuvre(state):
-    return state.mode == "ENGAGED" and state.x_m > 20.0
 
 
 def trial(out):
@@ -103,8 +101,9 @@ def test_the_double_lane_change_passes(tmp_path):
     assert compared == [("gateway", 0, ""), ("controller", 0, "")]
 
 
+@pytest.mark.parametrize("drive", ["lane-keeping"], indirect=True)
 def test_a_killed_controller_stops_the_car_and_is_named(drive):
-    drive.wait_for(in_manoeuvre, "the manoeuvre")
+    drive.wait_for(lambda state: is_engaged(state) and state.vx_mps > 3.0, "the car to drive")
     os.kill(drive.children["controller"], signal.SIGKILL)
     wait_until(lambda: drive.state.mode == "SAFE_STOP", 5, "the safe stop")
     wait_until(lambda: abs(drive.state.vx_mps) < 0.15, 30, "standstill")
@@ -181,7 +180,7 @@ def test_a_run_tells_the_controller_of_its_objects_and_keeps_what_was_tuned(tmp_
 
 
 def test_interrupting_a_real_car_stops_it_first(tmp_path):
-    port, emulator_port = free_base_port(), free_base_port() + 40
+    port, emulator_port = free_base_port(), free_base_port()
     channel = f"vehil-{os.getpid()}"
     hub = start_xilgate("bus", channel)
     wait_until(lambda: is_served(channel), 20, "the bus")
