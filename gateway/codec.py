@@ -78,11 +78,11 @@ class RobotLimits:
     """Limits that travel with every command for the robots to apply themselves."""
 
     steering_wheel_rate_radps: float
+    max_speed_mps: float
     steering_torque_nm: float = 40.0
     pedal_rate_mps: float = 1.0
     accelerator_force_n: float = 200.0
     brake_force_n: float = 1000.0
-    max_speed_mps: float = 36.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -224,17 +224,19 @@ def settling(good_ns: int) -> list[str]:
 
 
 def untimely(request: OperatorRequest, now_ns: int, last_ns: int) -> str:
-    """Why a request must not act at this time; empty when it may.
+    """Why a request must not act at this time; empty when it may. A STOP always may: at worst, a replay stops the car.
 
     Args:
         last_ns: time of the request that was looked at last [ns]; all who ask share one clock.
     """
+    if request.operation is Operation.STOP:
+        return ""
     age_ns = now_ns - request.t_ns
     if age_ns < 0:
         return "the request is from the future"
     if request.t_ns <= last_ns:
         return "the request is repeated, or made before another one"
-    if age_ns > MAX_REQUEST_AGE_NS and request.operation is not Operation.STOP:
+    if age_ns > MAX_REQUEST_AGE_NS:
         return f"the request is {age_ns * 1e-9:.1f} s old, limit {MAX_REQUEST_AGE_NS * 1e-9:.0f} s"
     return ""
 

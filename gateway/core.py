@@ -25,6 +25,8 @@ from gateway.transmit import TransmitGate
 
 TICK_NS = 10_000_000
 """Period of the gateway [ns]: that of the fastest cyclic messages."""
+ROBOT_SPEED_MARGIN = 1.1
+"""Speed at which the robots stop the car by themselves, over that at which the gateway does it gently."""
 ENGAGE_GRACE_NS = 200_000_000
 """Time that the robots have to follow into Engaged [ns]."""
 
@@ -66,7 +68,7 @@ class GatewayCore:
         self.profile = profile
         self._ratio = vehicle.steering.ratio
         self._boot_id = boot_id
-        self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps))
+        self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps, ROBOT_SPEED_MARGIN * profile.max_speed_mps))
         self._navigation_timeout_ns = catalogue.by_name[_TIME_MESSAGE].timeout_ns
         self._monitor_ticks = catalogue.by_name["GW_Status"].cycle_time_ns // TICK_NS
         self._modes = ModeMachine()
@@ -201,7 +203,7 @@ class GatewayCore:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
         if refused := untimely(request, situation.now_ns, self._last_request_ns):
             return [refused]
-        self._last_request_ns = request.t_ns
+        self._last_request_ns = max(request.t_ns, self._last_request_ns)
         trigger = _TRIGGER_OF_OPERATION.get(request.operation) or REACTIONS[_CAUSE_OF_OPERATION[request.operation]]
         if (self.mode, trigger) not in TRANSITIONS:
             return [f"not possible in {self.mode.name}"]

@@ -24,9 +24,9 @@ class Trigger(Enum):
     """What can change the mode, the gravest first: when several happen in one tick, the first that has a row acts."""
 
     GIVE_UP = "the robots cannot be relied on"
+    HAND_OVER = "driver or operator takes over"
     STOP = "stop"
     STOP_GENTLY = "gentle stop"
-    HAND_OVER = "driver or operator takes over"
     RESET = "operator reset"
     BLOCKED = "not ready"
     ENGAGE = "operator engaged"

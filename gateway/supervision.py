@@ -21,7 +21,7 @@ RECOVERY_NS = 1_000_000_000
 
 FLOW_WINDOW_NS = 130_000_000
 """Time over which losses are counted [ns]: with 20 % lost the reaction is to come within 150 ms."""
-MAX_LOST_FRAMES = 8
+MAX_LOST_FRAMES = 5
 """Frames lost in that time that are only counted, of about 160: with 1 % lost there are 2, with 20 % there are 31."""
 MAX_FLOW_CYCLE_NS = 10_000_000
 

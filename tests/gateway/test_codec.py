@@ -5,7 +5,7 @@ import pytest
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC, CatalogueError, load
 from gateway.codec import Codec, RobotLimits
 
-LIMITS = RobotLimits(steering_wheel_rate_radps=10.0)
+LIMITS = RobotLimits(steering_wheel_rate_radps=10.0, max_speed_mps=36.0)
 
 
 @pytest.mark.parametrize(

@@ -278,4 +278,5 @@ def test_a_request_acts_once_and_soon_or_not_at_all():
     assert asked(NOW_NS - 5, NOW_NS - 5) == asked(NOW_NS - 6, NOW_NS - 5) == "the request is repeated, or made before another one"
     for operation in (Operation.ARM, Operation.ENGAGE, Operation.DISENGAGE, Operation.RESET):
         assert asked(NOW_NS - 1_001 * MS, operation=operation) == "the request is 1.0 s old, limit 1 s"
-    assert asked(NOW_NS - 1_001 * MS, operation=Operation.STOP) == ""
+    for t_ns in (NOW_NS - 1_001 * MS, NOW_NS + 1, NOW_NS - 5):
+        assert asked(t_ns, NOW_NS - 5, operation=Operation.STOP) == ""

@@ -230,6 +230,14 @@ def _demand_while_armed(name):
     return break_it
 
 
+def _abandoned_stop():
+    return Script().engage().stop(seconds=0.5).go("Disarm").tick(1)
+
+
+def _abandoned_drive():
+    return Script().engage().go("Disarm").tick(1)
+
+
 def _half_engaged():
     script = Script().engage()
     script.is_enabled = False
@@ -334,7 +342,7 @@ BROKEN = [
     ("unasked", _after_restart), ("authority", _after_restart),
     ("not neutral", _enabled_while_armed), ("not neutral", _demand_while_armed("angle_deg")),
     ("not neutral", _demand_while_armed("drive_percent")), ("not neutral", _demand_while_armed("brake_percent")),
-    ("authority", _half_engaged), ("authority", engaged(request="Arm", is_enabled=False)),
+    ("abandoned", _abandoned_stop), ("abandoned", _abandoned_drive), ("authority", _half_engaged), ("authority", engaged(request="Arm", is_enabled=False)),
     ("stale command", engaged(age_ms=101.0)), ("max speed", engaged(max_speed_kmh=200.0)), ("watchdog", engaged(answer=0)),
     ("measurement id", engaged(measurement_id=2)),
     ("steering angle", _ramp("angle_deg", 4.0, 120, speed_mps=0.0)), ("steering rate", _ramp("angle_deg", 8.2, 1, speed_mps=0.0)),
@@ -419,6 +427,14 @@ def test_silence_and_letting_go_are_both_reactions_to_a_dead_bus(react):
     assert "reaction" not in in_time.rules
     assert [answer.latency_ns for answer in in_time.oracle.reactions] == [53 * MS]
     assert "reaction" in reaction("F10", 7, react).rules
+
+
+def test_a_driver_or_an_operator_may_have_the_car():
+    for sign in ("RC_SafetyStatus", "SR_Status"):
+        script = Script().engage()
+        script.car(sign, {"DriverOverride": 1})
+        assert script.go("Disarm").tick(1).rules == set()
+    assert Script().engage().ask("DISENGAGE").go("Disarm").tick(1).rules == set()
 
 
 def test_a_stop_by_the_gateway_is_no_answer_to_the_driver():

@@ -39,6 +39,8 @@ _SPEED_WINDOW_NS = 120 * MS  # age of a speed that the gateway may still rely on
 _STEER_LSB_DEG, _PEDAL_LSB_PERCENT, _ACCELERATION_LSB_MPS2 = 0.05, 0.01, 0.01
 _NEUTRAL_MODES = ("Off", "Standby")
 _SILENT_NS = 30 * MS
+_DRIVER_NS = 100 * MS
+_NEVER_NS = 1 << 62
 _UNSAFE = {Kind.STOP: ("Engage",), Kind.RELEASE: ("Engage", "Stop"), Kind.SILENCE: ("Engage", "Stop")}
 """What the gateway must no longer claim after a fault, by the reaction that is due."""
 
@@ -115,6 +117,7 @@ class BusOracle:
         self._now_ns = 0
         self._speeds: deque[tuple[int, float]] = deque()
         self._felt_deceleration_mps2 = 0.0
+        self._driver_ns = -_NEVER_NS
         self._question_counter = 0
         self._questions: deque[tuple[int, int]] = deque(maxlen=8)
         self._commanded_ns = 0
@@ -193,10 +196,16 @@ class BusOracle:
                 self._speeds.popleft()
         elif message.name == "AccelLevel":
             self._felt_deceleration_mps2 = -message.value(data, "AccelForward")
-        elif message.name == "RC_SafetyStatus" and message.data_id is not None and profile2_crc(data, message.data_id) == data[0]:
-            step, self._question_counter = (counter_of(data) - self._question_counter) % 16, counter_of(data)
-            if 1 <= step <= 3:  # AUTOSAR profile 2: a receiver may lose two frames in a row
-                self._questions.append((t_ns, int(message.value(data, "WatchdogQuestion"))))
+        elif message.data_id is not None and profile2_crc(data, message.data_id) == data[0]:
+            if message.value(data, "DriverOverride"):
+                self._driver_ns = t_ns
+            if message.name == "RC_SafetyStatus":
+                self._learn_question(t_ns, message, data)
+
+    def _learn_question(self, t_ns: int, message: WireMessage, data: bytes) -> None:
+        step, self._question_counter = (counter_of(data) - self._question_counter) % 16, counter_of(data)
+        if 1 <= step <= 3:  # AUTOSAR profile 2: a receiver may lose two frames in a row
+            self._questions.append((t_ns, int(message.value(data, "WatchdogQuestion"))))
 
     def _speed_mps(self) -> float:
         """The smallest speed that the gateway may have relied on."""
@@ -274,14 +283,23 @@ class BusOracle:
             self._violate(t_ns, "authority", f"{before or 'silent'} -> {authority}")
         if self._knows_requests:
             needed = {"Arm": ("ARM",), "Engage": ("ENGAGE",)}.get(authority, ("ARM", "RESET") if before is None else ())
-            if needed and not any(t_ns - self._requests.get(name, -(1 << 62)) <= REQUEST_WINDOW_NS + self._jitter_ns for name in needed):
+            if needed and not any(t_ns - self._requests.get(name, -_NEVER_NS) <= REQUEST_WINDOW_NS + self._jitter_ns for name in needed):
                 self._violate(t_ns, "unasked", f"{before or 'silent'} -> {authority} without a request for it")
+        if before in ("Engage", "Stop") and authority != "Stop" and t_ns - self._commanded_ns <= _SILENT_NS:
+            self._judge_letting_go(t_ns, before, authority)
         if authority == "Stop":
             # A car that brakes already goes on braking; it feels a little more than the pedal is asked for.
             self._entry_deceleration_mps2 = max(self._deceleration_mps2, self._felt_deceleration_mps2 + _ACCELERATION_LSB_MPS2)
         if authority not in ("Engage", "Stop"):
             self._steer.clear()
         self.authority, self._entered_ns = authority, t_ns
+
+    def _judge_letting_go(self, t_ns: int, before: str, authority: str) -> None:
+        """A moving car is let go when somebody has taken it: a driver whom the robots feel, or an operator who has said so."""
+        is_taken = t_ns - self._driver_ns <= _DRIVER_NS
+        is_asked = before == "Engage" and t_ns - self._requests.get("DISENGAGE", -_NEVER_NS) <= REQUEST_WINDOW_NS + self._jitter_ns
+        if self._speed_mps() > STANDING_MPS and not is_taken and not (is_asked or not self._knows_requests):
+            self._violate(t_ns, "abandoned", f"{before} -> {authority} at {self._speed_mps():.1f} m/s, and nobody has taken over")
 
     def _judge_watchdog(self, t_ns: int, answer: int, authority: str) -> None:
         if not self._questions or authority not in ("Engage", "Stop"):

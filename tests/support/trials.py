@@ -73,6 +73,10 @@ FAULTS = (
 )
 
 
+AFTERMATH_NS = 3_000 * MS
+"""One trial of ten goes on with its fault: a stop that has begun must be held."""
+
+
 @dataclass
 class Trial:
     """What one trial found; its name repeats it (`repeat`).
@@ -115,7 +119,7 @@ def run(fault: Fault, seed: int) -> Trial:
     world = prepared(str(fault), seed)
     with named(str(fault), seed):
         fault.inject(world)
-        world.run(fault.duration_ns)
+        world.run(fault.duration_ns + (AFTERMATH_NS if seed % 10 == 9 else 0))
     return Trial(str(fault), seed, world.oracle.finish(world.now_ns), world.oracle.reactions)
 
 
