@@ -81,8 +81,8 @@ class Actuation:
     def __init__(self, vehicle: Vehicle, profile: LimitProfile, tick_ns: int, resolution: Resolution | None = None) -> None:
         self._vehicle = vehicle
         self._profile = profile
+        self._tick_ns = tick_ns
         self._tick_s = tick_ns * 1e-9
-        self._ramp_ticks = PLAN_PERIOD_NS // tick_ns
         self._resolution = resolution or Resolution()
         self._wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
         self._full_drive_mps2 = vehicle.pedals.full_drive_force_n / vehicle.model.mass_kg
@@ -90,7 +90,7 @@ class Actuation:
         self._drive_step_mps2 = self._resolution.pedal_norm * self._full_drive_mps2
         self._brake_step_mps2 = self._resolution.pedal_norm * self._full_brake_mps2
         self._behind: Counter[str] = Counter()
-        self._is_held_back = False
+        self._held_back: set[str] = set()
         self.demand = NEUTRAL
         self.engaged_ticks = 0
         self.held_back_ticks = 0
@@ -105,7 +105,7 @@ class Actuation:
     @property
     def acceleration_mps2(self) -> float:
         """What the pedals are asked for [m/s2]; negative brakes."""
-        return self.demand.accelerator_norm * self._full_drive_mps2 - self.demand.brake_norm * self._full_brake_mps2
+        return self._acceleration_mps2(self.demand.accelerator_norm, self.demand.brake_norm)
 
     def drive_norm(self, accelerator_norm: float, brake_norm: float) -> float:
         """Drive demand that two pedal positions stand for; the inverse of the split."""
@@ -119,29 +119,36 @@ class Actuation:
     def start_from(self, measured: Demand) -> None:
         """Take over from where the robots are, so that an engagement has no bump."""
         step_rad = self._resolution.steering_wheel_rad
-        acceleration_mps2 = measured.accelerator_norm * self._full_drive_mps2 - measured.brake_norm * self._full_brake_mps2
+        acceleration_mps2 = self._acceleration_mps2(measured.accelerator_norm, measured.brake_norm)
         pedals = self._split(acceleration_mps2, -self._full_brake_mps2, self._full_drive_mps2)
         self.demand = Demand(round(measured.steering_wheel_rad / step_rad) * step_rad, *pedals)
         self._behind.clear()
 
     def hold_still(self) -> None:
-        """Keep a standing car standing."""
-        self._limit(self.demand.steering_wheel_rad, -self._profile.standstill_brake_norm * self._full_brake_mps2, 0.0, 0.0)
+        """Keep a standing car standing, with the steering wheel where it is."""
+        self._begin_tick()
+        self._end_tick(self.demand.steering_wheel_rad, -self._profile.standstill_brake_norm * self._full_brake_mps2)
 
     def decelerate(self, steer_rad: float, deceleration_mps2: float, vx_mps: float, brake_norm: float) -> None:
         """Steer and slow down; `brake_norm` is the measured pedal."""
-        self._limit(steer_rad * self._vehicle.steering.ratio, -deceleration_mps2, vx_mps, brake_norm)
+        self.follow(steer_rad, -deceleration_mps2 / self._full_drive_mps2, vx_mps, brake_norm)
 
     def follow(self, steer_rad: float, drive_norm: float, vx_mps: float, brake_norm: float) -> None:
         """Follow a command as far as the limits let it; `brake_norm` is the measured pedal."""
-        self._limit(steer_rad * self._vehicle.steering.ratio, drive_norm * self._full_drive_mps2, vx_mps, brake_norm)
+        self._begin_tick()
+        steps = self._limit_steering(steer_rad * self._vehicle.steering.ratio, abs(vx_mps))
+        acceleration_mps2 = drive_norm * self._full_drive_mps2
+        if brake_norm >= BRAKE_RELEASED_NORM:
+            acceleration_mps2 = min(acceleration_mps2, 0.0)  # interlock: the accelerator waits until the brake pedal has really come back
+        self._end_tick(steps * self._resolution.steering_wheel_rad, acceleration_mps2)
 
-    def _limit(self, steering_wheel_rad: float, acceleration_mps2: float, vx_mps: float, brake_norm: float) -> None:
+    def _begin_tick(self) -> None:
         self.engaged_ticks += 1
-        self._is_held_back = False
-        limited_rad = self._limit_steering(steering_wheel_rad, abs(vx_mps)) * self._resolution.steering_wheel_rad
-        self.demand = Demand(limited_rad, *self._limit_pedals(acceleration_mps2, brake_norm))
-        self.held_back_ticks += self._is_held_back
+        self._held_back.clear()
+
+    def _end_tick(self, steering_wheel_rad: float, acceleration_mps2: float) -> None:
+        self.demand = Demand(steering_wheel_rad, *self._limit_pedals(acceleration_mps2))
+        self.held_back_ticks += bool(self._held_back)
 
     def _limit_steering(self, asked_rad: float, speed_mps: float) -> int:
         """Steering-wheel angle in steps of the bus."""
@@ -182,18 +189,10 @@ class Actuation:
     def _lateral_mps2(self, steering_wheel_rad: float, speed_mps: float) -> float:
         return lateral_acceleration_mps2(steering_wheel_rad / self._vehicle.steering.ratio, self._wheelbase_m, speed_mps)
 
-    def _limit_pedals(self, asked_mps2: float, brake_norm: float) -> tuple[float, float]:
+    def _limit_pedals(self, asked_mps2: float) -> tuple[float, float]:
         """Accelerator and brake pedal."""
-        profile, before_mps2 = self._profile, self.acceleration_mps2
-        top_mps2 = min(profile.acceleration_mps2, self._full_drive_mps2)
-        bottom_mps2 = -min(profile.deceleration_mps2, self._full_brake_mps2)
-        driven_mps2 = min(asked_mps2, top_mps2)
-        self._note(ACCELERATION, asked_mps2, top_mps2, driven_mps2)
-        target_mps2 = max(driven_mps2, bottom_mps2)
-        self._note(DECELERATION, driven_mps2, bottom_mps2, target_mps2)
-        if brake_norm >= BRAKE_RELEASED_NORM:
-            target_mps2 = min(target_mps2, 0.0)  # interlock: the accelerator waits until the brake pedal has really come back
-        drive_mps2, brake_mps2 = profile.drive_jerk_mps3 * self._tick_s, profile.brake_jerk_mps3 * self._tick_s
+        before_mps2, target_mps2 = self.acceleration_mps2, self._bound_acceleration(asked_mps2)
+        drive_mps2, brake_mps2 = self._profile.drive_jerk_mps3 * self._tick_s, self._profile.brake_jerk_mps3 * self._tick_s
         low_mps2 = min(before_mps2, 0.0) - brake_mps2
         high_mps2 = min(before_mps2 + brake_mps2, 0.0) if before_mps2 < 0.0 else before_mps2 + drive_mps2
         for name, bound_mps2, reached_mps2 in (
@@ -201,15 +200,29 @@ class Actuation:
             (BRAKE_JERK, low_mps2, max(target_mps2, low_mps2)),
         ):
             self._note(name, *((value_mps2 - before_mps2) / self._tick_s for value_mps2 in (target_mps2, bound_mps2, reached_mps2)))
-        if bottom_mps2 + self._brake_step_mps2 <= high_mps2:
-            low_mps2, high_mps2 = max(low_mps2, bottom_mps2), min(high_mps2, top_mps2)
         return self._split(clamp(target_mps2, low_mps2, high_mps2), low_mps2, high_mps2)
+
+    def _bound_acceleration(self, asked_mps2: float) -> float:
+        """The nearest acceleration that is allowed when time does not count, on steps of the bus."""
+        top_mps2 = min(self._profile.acceleration_mps2, self._full_drive_mps2)
+        bottom_mps2 = -min(self._profile.deceleration_mps2, self._full_brake_mps2)
+        driven_mps2 = min(asked_mps2, top_mps2)
+        self._note(ACCELERATION, asked_mps2, top_mps2, driven_mps2)
+        bounded_mps2 = max(driven_mps2, bottom_mps2)
+        self._note(DECELERATION, driven_mps2, bottom_mps2, bounded_mps2)
+        return self._acceleration_mps2(*self._split(bounded_mps2, bottom_mps2, top_mps2))
+
+    def _acceleration_mps2(self, accelerator_norm: float, brake_norm: float) -> float:
+        return accelerator_norm * self._full_drive_mps2 - brake_norm * self._full_brake_mps2
 
     def _split(self, acceleration_mps2: float, low_mps2: float, high_mps2: float) -> tuple[float, float]:
         """Accelerator or brake for an acceleration, on steps of the bus within [low, high]."""
-        if acceleration_mps2 >= 0.0:
-            return steps_within(acceleration_mps2, low_mps2, high_mps2, self._drive_step_mps2) * self._resolution.pedal_norm, 0.0
-        return 0.0, steps_within(-acceleration_mps2, -high_mps2, -low_mps2, self._brake_step_mps2) * self._resolution.pedal_norm
+        drive_mps2, lowest_mps2, highest_mps2 = (max(value, 0.0) for value in (acceleration_mps2, low_mps2, high_mps2))
+        brake_mps2, weakest_mps2, firmest_mps2 = (max(-value, 0.0) for value in (acceleration_mps2, high_mps2, low_mps2))
+        return (
+            steps_within(drive_mps2, lowest_mps2, highest_mps2, self._drive_step_mps2) * self._resolution.pedal_norm,
+            steps_within(brake_mps2, weakest_mps2, firmest_mps2, self._brake_step_mps2) * self._resolution.pedal_norm,
+        )
 
     def _note(self, name: str, asked: float, limit: float, given: float) -> None:
         """Keep account of a limit in this tick."""
@@ -219,8 +232,8 @@ class Actuation:
         self._behind[name] += 1
         self.limited[name] += 1
         self.last_limited[name] = Activation(self.engaged_ticks, asked, limit, given)
-        if name not in _RATES or self._behind[name] >= self._ramp_ticks:
-            self._is_held_back = True
+        if name not in _RATES or self._behind[name] * self._tick_ns >= PLAN_PERIOD_NS:
+            self._held_back.add(name)
 
 
 def _approach(before: int, target: int, low: float, high: float) -> int:

@@ -58,6 +58,7 @@ class ControlCycle:
         self._core = preparation.new_core(boot_id)
         self._sampler = GatewaySampler()
         self._hashes = dict(preparation.hashes)
+        self._names = {arbitration_id: spec.name for arbitration_id, spec in preparation.catalogue.by_id.items()}
         self._realtime = {name: str(grant) for name, grant in pulse.realtime.items()}
         self._record = NO_RECORD
         self._ending: Ending | None = None
@@ -137,6 +138,8 @@ class ControlCycle:
 
     def _process(self, overruns: int, cpu_ns: int) -> Process:
         buses = self._links.buses
+        traffic = buses.traffic()
+        rates_hz = {arbitration_id: rate_hz for one in traffic.values() for arbitration_id, rate_hz in one.rates_hz.items()}
         rejected = {"controller": self._links.channel.rejected, "operator": self._links.operators.rejected}
         return Process(
             ticks_late=overruns,
@@ -150,6 +153,8 @@ class ControlCycle:
             record_problem=self._record.problem,
             realtime=self._realtime,
             hashes=self._hashes,
+            bus_load={network: one.load_norm for network, one in traffic.items()},
+            message_rates_hz={self._names[arbitration_id]: rate_hz for arbitration_id, rate_hz in rates_hz.items()},
         )
 
     def _heed_orders(self, now_ns: int, output: StepOutput) -> None:

@@ -22,13 +22,13 @@ class LatencyChain:
     """Measures the age at actuation of every command.
 
     Attributes:
-        newest_ns: the newest age; None before the first.
+        newest_ns: the newest age; 0 before the first.
         max_ns: the largest since `restart`.
         histogram: ages by bucket, since the start of the process.
     """
 
     def __init__(self) -> None:
-        self.newest_ns: int | None = None
+        self.newest_ns = 0
         self.max_ns = 0
         self.histogram = [0] * (len(BUCKETS_NS) + 1)
         self._id = 0
@@ -67,5 +67,5 @@ class LatencyChain:
         overdue_ns = [now_ns - state_t_ns for state_t_ns in self._awaited.values() if now_ns - state_t_ns > MAX_AGE_NS]
         if self._late_in_a_row + len(overdue_ns) <= MAX_LATE_IN_A_ROW:
             return []
-        value_ns = max(overdue_ns, default=self.newest_ns or 0)
+        value_ns = max(overdue_ns, default=self.newest_ns)
         return [Finding(Cause.LATENCY, value_ns * _MS_PER_NS, MAX_AGE_NS * _MS_PER_NS, "robots")]

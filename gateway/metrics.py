@@ -65,6 +65,11 @@ def _of_status(status: StatusSample) -> Iterable[Metric]:
         _counter("ticks_unrecorded", "Ticks missing in the record.", status.ticks_unrecorded),
         GaugeMetricFamily(_PREFIX + "blockers", "Conditions that keep the gateway from the next mode.", len(status.blockers)),
         GaugeMetricFamily(_PREFIX + "command_age_seconds", "Age of the newest command.", status.command_age_ms * 1e-3),
+        _labelled(CounterMetricFamily, "limited_ticks", "Ticks in which a limit changed the demand.", "limit",
+                  {name: one.ticks for name, one in status.limits.items()}),
+        GaugeMetricFamily(_PREFIX + "actuation_age_seconds", "Age of the measurement that robots act on.", status.actuation_age_ms * 1e-3),
+        _labelled(GaugeMetricFamily, "bus_load", "Share of the last second in which it was busy.", "bus", status.bus_load),
+        _labelled(GaugeMetricFamily, "message_rate_hertz", "Frames per second.", "message", status.message_rates_hz),
         _sha256(status.hashes),
     )
 

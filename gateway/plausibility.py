@@ -56,47 +56,58 @@ class _Held:
     def update(self, now_ns: int, is_there: bool) -> bool:
         """Whether it has been there for its time, without a break."""
         if not is_there:
-            self._since_ns = None
+            self.reset()
             return False
         if self._since_ns is None:
             self._since_ns = now_ns
         return now_ns - self._since_ns >= self._hold_ns
 
+    def reset(self) -> None:
+        """It is not there."""
+        self._since_ns = None
+
 
 class _Motion:
-    """Position and heading against what speed and yaw rate make of them, over the last `MOTION_WINDOW_MS` of navigation time.
-
-    What is measured less what the rates add up to is constant when both are right; it is kept for the window.
-    """
+    """Position and heading against what speed and yaw rate make of them, over the last `MOTION_WINDOW_MS` of navigation time."""
 
     def __init__(self) -> None:
-        self._rows: deque[tuple[int, float, float, float]] = deque()
-        self._time_ms = -1
-        self._x_m = self._y_m = self._yaw_rad = self._turned_rad = 0.0
-        self.position_error_m = 0.0
-        self.yaw_rate_error_radps = 0.0
+        self._before: tuple[int, float, float, float] | None = None
+        self._steps: deque[tuple[int, float, float, float]] = deque()
 
     def update(self, m: Measurement) -> None:
-        """Take in a measurement with a new time of validity."""
-        elapsed_ms = m.navigation_time_ms - self._time_ms
-        if self._time_ms < 0 or not 0 < elapsed_ms <= MOTION_WINDOW_MS:
-            self._rows.clear()
-        else:
-            self._advance(m, elapsed_ms * 1e-3)
-        self._time_ms, self._yaw_rad = m.navigation_time_ms, m.yaw_rad
-        self._rows.append((self._time_ms, m.x_m - self._x_m, m.y_m - self._y_m, self._turned_rad))
-        while self._time_ms - self._rows[0][0] > MOTION_WINDOW_MS:
-            self._rows.popleft()
-        _, x_m, y_m, turned_rad = self._rows[0]
-        self.position_error_m = math.hypot(m.x_m - self._x_m - x_m, m.y_m - self._y_m - y_m)
-        self.yaw_rate_error_radps = (self._turned_rad - turned_rad) / (MOTION_WINDOW_MS * 1e-3)
+        """Take in a measurement; nothing is new without a new time of validity."""
+        now = (m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad)
+        before = self._before or now
+        elapsed_ms = m.navigation_time_ms - before[0]
+        if elapsed_ms in range(1, MOTION_WINDOW_MS + 1):
+            self._steps.append(_unexplained(before, m, elapsed_ms * 1e-3))
+            while m.navigation_time_ms - self._steps[0][0] >= MOTION_WINDOW_MS:
+                self._steps.popleft()
+        elif elapsed_ms:
+            self._steps.clear()
+        self._before = now if elapsed_ms else before
 
-    def _advance(self, m: Measurement, elapsed_s: float) -> None:
-        """Go on with the measured rates; the heading counts as how much it has turned more than the yaw rate says."""
-        cosine, sine = math.cos(m.yaw_rad), math.sin(m.yaw_rad)
-        self._x_m += (m.vx_mps * cosine - m.vy_mps * sine) * elapsed_s
-        self._y_m += (m.vx_mps * sine + m.vy_mps * cosine) * elapsed_s
-        self._turned_rad += math.remainder(m.yaw_rad - self._yaw_rad, math.tau) - m.yaw_rate_radps * elapsed_s
+    @property
+    def position_error_m(self) -> float:
+        """How far the position has moved otherwise than the speed says."""
+        return math.hypot(sum(x_m for _, x_m, _, _ in self._steps), sum(y_m for _, _, y_m, _ in self._steps))
+
+    @property
+    def yaw_rate_error_radps(self) -> float:
+        """How much faster the heading has turned than the yaw rate says, mean over the window."""
+        return sum(yaw_rad for *_, yaw_rad in self._steps) / (MOTION_WINDOW_MS * 1e-3)
+
+
+def _unexplained(before: tuple[int, float, float, float], m: Measurement, elapsed_s: float) -> tuple[int, float, float, float]:
+    """Time, and what of the step in x, y and heading is not explained by speed and yaw rate."""
+    _, x_m, y_m, yaw_rad = before
+    cosine, sine = math.cos(m.yaw_rad), math.sin(m.yaw_rad)
+    return (
+        m.navigation_time_ms,
+        m.x_m - x_m - (m.vx_mps * cosine - m.vy_mps * sine) * elapsed_s,
+        m.y_m - y_m - (m.vx_mps * sine + m.vy_mps * cosine) * elapsed_s,
+        math.remainder(m.yaw_rad - yaw_rad, math.tau) - m.yaw_rate_radps * elapsed_s,
+    )
 
 
 class Plausibility:
@@ -113,9 +124,7 @@ class Plausibility:
         self._steering_limit_radps = STEERING_RATE_SHARE * robot.rate_limit_radps
         self._following_ns = FOLLOWING_NS + round(robot.dead_time_s * _NS_PER_S)
         self._motion = _Motion()
-        self._navigation_time_ms = -1
-        self._steering_rad: float | None = None
-        self._steered_ns = 0
+        self._steered: tuple[int, float] | None = None
         self._demands_rad: deque[tuple[int, float]] = deque()
         self._speed = _Held(SPEED_HOLD_NS)
         self._position, self._yaw_rate = _Held(MOTION_HOLD_NS), _Held(MOTION_HOLD_NS)
@@ -140,17 +149,15 @@ class Plausibility:
             found += self._judge_pedals(now_ns, measurement)
         else:
             for held in (self._following, self._brake, self._accelerator):
-                held.update(now_ns, False)
+                held.reset()
         return found
 
     def _judge_navigation(self, now_ns: int, m: Measurement) -> list[Finding]:
-        if m.navigation_time_ms != self._navigation_time_ms:
-            self._navigation_time_ms = m.navigation_time_ms
-            self._motion.update(m)
-        wheels_mps = median(m.wheel_speed_radps) * self._wheel_radius_m
+        self._motion.update(m)
+        wheels_mps = m.vx_mps if self._is_on_lift else median(m.wheel_speed_radps) * self._wheel_radius_m
         position_limit_m = clamp(0.5 * abs(m.vx_mps) * MOTION_WINDOW_MS * 1e-3, *POSITION_LIMITS_M)
         checks = (
-            (self._speed, Cause.SPEED_IMPLAUSIBLE, 0.0 if self._is_on_lift else wheels_mps - m.vx_mps, SPEED_LIMIT_MPS),
+            (self._speed, Cause.SPEED_IMPLAUSIBLE, wheels_mps - m.vx_mps, SPEED_LIMIT_MPS),
             (self._position, Cause.POSITION_IMPLAUSIBLE, self._motion.position_error_m, position_limit_m),
             (self._yaw_rate, Cause.YAW_RATE_IMPLAUSIBLE, self._motion.yaw_rate_error_radps, YAW_RATE_LIMIT_RADPS),
         )
@@ -161,12 +168,11 @@ class Plausibility:
         ]
 
     def _judge_steering_rate(self, now_ns: int, m: Measurement) -> list[Finding]:
-        before_rad, before_ns = self._steering_rad, self._steered_ns
+        before_ns, before_rad = self._steered or (now_ns, m.steering_wheel_rad)
         if m.steering_wheel_rad == before_rad:
+            self._steered = (before_ns, before_rad)
             return []
-        self._steering_rad, self._steered_ns = m.steering_wheel_rad, now_ns
-        if before_rad is None:
-            return []
+        self._steered = (now_ns, m.steering_wheel_rad)
         elapsed_s = clamp(now_ns - before_ns, *STEERING_STEP_NS) / _NS_PER_S
         rate_radps = abs(m.steering_wheel_rad - before_rad) / elapsed_s
         if rate_radps <= self._steering_limit_radps:

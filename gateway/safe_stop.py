@@ -14,7 +14,7 @@ STANDSTILL_MPS = 0.1
 
 def plan_index(command: ControlCommand, now_ns: int) -> int:
     """Entry of a command's plan that holds at `now_ns`; the last one after the plan's end."""
-    return min(max(0, now_ns - command.t_ns) // PLAN_PERIOD_NS, HORIZON_STEPS - 1)
+    return min(max((now_ns - command.t_ns) // PLAN_PERIOD_NS, 0), HORIZON_STEPS - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,9 @@ class SafeStop:
     Args:
         last_command: the newest valid command, or None when there never was one.
         steer_rad: road-wheel angle to hold without a plan [rad].
-        deceleration_mps2: deceleration at the start, so that a car that brakes already goes on braking.
+        deceleration_mps2: deceleration at the start: a car that brakes already goes on from there, and a comfort stop that becomes an
+            emergency stop from what it has reached.
+        grade: how firmly.
     """
 
     def __init__(
@@ -53,7 +55,7 @@ class SafeStop:
 
     def demand(self, now_ns: int, vx_mps: float) -> StopDemand:
         """Demand at `now_ns` for a car at speed `vx_mps`; standing is latched."""
-        self._is_standing = self._is_standing or abs(vx_mps) < STANDSTILL_MPS
+        self._is_standing |= abs(vx_mps) < STANDSTILL_MPS
         elapsed_s = (now_ns - self._start_ns) * 1e-9
         deceleration_mps2 = max(
             self._initial_deceleration_mps2,

@@ -5,8 +5,10 @@ from dataclasses import dataclass, field
 from itertools import count
 
 from dbc.health import LinkHealth
+from gateway.actuation import UNITS, Actuation
+from gateway.causes import Disengagement
 from gateway.core import GatewayCore, StepOutput
-from gateway.telemetry import Sample, StateSample, StatusSample
+from gateway.telemetry import DisengagementReport, LimitActivation, Sample, StateSample, StatusSample
 
 STATE_EVERY_TICKS = 2
 STATUS_EVERY_TICKS = 10
@@ -27,6 +29,8 @@ class Process:
         ticks_unrecorded, record_problem: see `gateway.recorder.RecorderStatus`.
         realtime: what the control thread asked of the machine, and what it was refused.
         hashes: SHA-256 of all that it works with.
+        bus_load: share of the last second in which the bus of every network was busy.
+        message_rates_hz: frames per second by message.
     """
 
     ticks_late: int = 0
@@ -40,6 +44,8 @@ class Process:
     record_problem: str = ""
     realtime: Mapping[str, str] = field(default_factory=dict)
     hashes: Mapping[str, str] = field(default_factory=dict)
+    bus_load: Mapping[str, float] = field(default_factory=dict)
+    message_rates_hz: Mapping[str, float] = field(default_factory=dict)
 
 
 VIRTUAL = Process()
@@ -110,4 +116,34 @@ def _status(seq: int, core: GatewayCore, now_ns: int, process: Process) -> Statu
         record_problem=process.record_problem,
         realtime=dict(process.realtime),
         hashes=dict(process.hashes),
+        profile=core.profile.name,
+        limits=_limits(core.actuation),
+        limited_share=core.actuation.held_back_ticks / max(core.actuation.engaged_ticks, 1),
+        disengagement=None if core.disengagement is None else _report(core.disengagement),
+        actuation_age_ms=core.latency.newest_ns * 1e-6,
+        actuation_age_max_ms=core.latency.max_ns * 1e-6,
+        bus_load=dict(process.bus_load),
+        message_rates_hz=dict(process.message_rates_hz),
+    )
+
+
+def _limits(actuation: Actuation) -> dict[str, LimitActivation]:
+    return {
+        name: LimitActivation(
+            ticks=actuation.limited[name], unit=UNITS[name], asked=last.asked, limit=last.limit, given=last.given
+        )
+        for name, last in actuation.last_limited.items()
+    }
+
+
+def _report(disengagement: Disengagement) -> DisengagementReport:
+    finding = disengagement.finding
+    return DisengagementReport(
+        t_ns=disengagement.t_ns,
+        cause=finding.cause.name,
+        code=finding.cause.code,
+        value=finding.value,
+        limit=finding.limit,
+        unit=finding.cause.value.unit,
+        source=finding.source,
     )

@@ -149,6 +149,40 @@ class ParametersSample(Sample, frozen=True, kw_only=True):
     reverts: list[int]
 
 
+class LimitActivation(msgspec.Struct, frozen=True, kw_only=True):
+    """How often a limit of the gateway has changed a demand, and the last time it did.
+
+    Args:
+        ticks: in which it did, since the start.
+        asked, limit, given: what came in, what is allowed, what went out, in `unit`.
+    """
+
+    ticks: int
+    unit: str
+    asked: float
+    limit: float
+    given: float
+
+
+class DisengagementReport(msgspec.Struct, frozen=True, kw_only=True):
+    """How an engagement ended.
+
+    Args:
+        t_ns: monotonic time [ns].
+        cause, code: by name, and by the number on the bus.
+        value, limit: what was found and what is allowed, in `unit`.
+        source: message, robot, bus or process in which it was found.
+    """
+
+    t_ns: int
+    cause: str
+    code: int
+    value: float
+    limit: float
+    unit: str
+    source: str
+
+
 class StatusSample(Sample, frozen=True, kw_only=True):
     """Mode, reasons and counters of the gateway.
 
@@ -162,6 +196,13 @@ class StatusSample(Sample, frozen=True, kw_only=True):
         record_problem: why nothing is recorded; empty while all is well or nothing is to be.
         realtime: what the control thread asked of the machine, and what it was refused, for people.
         hashes: SHA-256 of files, limits and configuration, by name.
+        profile: limits in force, by name.
+        limits: activations of each limit that has acted.
+        limited_share: of the driven ticks, those in which a limit held a demand back.
+        disengagement: how the last engagement ended; None when none has.
+        actuation_age_ms, actuation_age_max_ms: age of the measurement on which the robots act, newest and largest of this engagement.
+        bus_load: share of the last second in which each bus was busy with known frames.
+        message_rates_hz: frames per second of the last second, by message.
     """
 
     mode: str
@@ -181,6 +222,14 @@ class StatusSample(Sample, frozen=True, kw_only=True):
     record_problem: str = ""
     realtime: dict[str, str] = {}
     hashes: dict[str, str] = {}
+    profile: str = ""
+    limits: dict[str, LimitActivation] = {}
+    limited_share: float = 0.0
+    disengagement: DisengagementReport | None = None
+    actuation_age_ms: float = 0.0
+    actuation_age_max_ms: float = 0.0
+    bus_load: dict[str, float] = {}
+    message_rates_hz: dict[str, float] = {}
 
 
 class WorldObject(msgspec.Struct, frozen=True, kw_only=True):

@@ -205,3 +205,24 @@ def test_a_command_that_came_between_two_steps_is_kept_for_the_next(bench):
     del bench.pacer.is_due
     bench.tick()
     assert bench.cycle._core.commands.newest is not admitted
+
+
+@pytest.mark.req("G4")
+def test_status_tells_of_limits_latency_traffic_and_how_an_engagement_ended(bench):
+    bench.engage().tick(30)
+    status = statuses(bench)[-1]
+    assert (status.profile, status.bus_load, status.message_rates_hz) == ("proving_ground", {"robots": 0.25}, {"SR_Status": 100.0})
+    assert (status.disengagement, status.limits, status.limited_share) == (None, {}, 0.0)
+    assert 0.0 < status.actuation_age_ms <= status.actuation_age_max_ms < 50.0
+    bench.plan_steer_rad = 0.9
+    bench.tick(12)
+    bench.car.override = 1
+    bench.tick(2)
+    status = statuses(bench)[-1]
+    limit = status.limits["steering angle"]
+    assert limit.ticks > 0
+    assert limit.unit == "rad"
+    assert limit.asked > limit.limit >= limit.given > 0.0
+    assert status.limited_share > 0.0
+    ended = status.disengagement
+    assert (ended.cause, ended.code, ended.source, ended.unit) == ("DRIVER_OVERRIDE", 63, "RC", "")

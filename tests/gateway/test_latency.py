@@ -32,7 +32,7 @@ def test_ids_count_up_and_come_round():
 
 def test_nothing_is_known_before_the_first_echo():
     chain = LatencyChain()
-    assert chain.newest_ns is None
+    assert chain.newest_ns == 0
     assert chain.max_ns == 0
     assert sum(chain.histogram) == 0
     assert chain.findings(10**12) == []
@@ -41,7 +41,7 @@ def test_nothing_is_known_before_the_first_echo():
 def test_age_is_from_the_state_to_the_first_echo():
     chain = LatencyChain()
     echo = chain.answered(1_000 * MS)
-    assert chain.newest_ns is None
+    assert chain.newest_ns == 0
     chain.echoed(echo, 1_037 * MS)
     chain.echoed(echo, 1_047 * MS)  # told again with every status: not new
     assert (chain.newest_ns, chain.max_ns) == (37 * MS, 37 * MS)
@@ -61,11 +61,11 @@ def test_the_largest_age_is_kept_since_the_engagement_the_histogram_for_ever():
 def test_an_id_nobody_waits_for_says_nothing():
     chain = LatencyChain()
     chain.echoed(5, 1_000 * MS)
-    assert chain.newest_ns is None
+    assert chain.newest_ns == 0
     echo = chain.answered(1_000 * MS)
     chain.restart()
     chain.echoed(echo, 1_010 * MS)  # answers what was before the engagement
-    assert chain.newest_ns is None
+    assert chain.newest_ns == 0
     assert sum(chain.histogram) == 0
 
 

@@ -2,6 +2,7 @@
 
 import math
 import random
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -196,6 +197,12 @@ def test_one_wheel_may_slip_or_fail(wheels, is_found):
     assert bool(drive.found) is is_found
 
 
+def test_a_car_is_on_the_road_unless_somebody_says_otherwise():
+    plausibility = Plausibility(CAR)
+    m = Measurement(navigation_time_ms=BEGIN_MS, wheel_speed_radps=(50.0,) * 4)
+    assert [bool(plausibility.update(k * TICK_NS, m, Demand(0.0, 0.0, 0.0), False)) for k in range(11)] == [False] * 10 + [True]
+
+
 def test_a_moment_of_slip_says_nothing():
     drive = Drive().step(30)
     for _ in range(10):
@@ -337,6 +344,14 @@ def test_a_slow_navigation_system_is_judged_by_its_own_time():
         assert not plausibility.update(now_ns + k * TICK_NS, m, Demand(0.0, 0.0, 0.0), False)
 
 
+def test_exactly_the_limit_is_allowed():
+    plausibility, now_ns = Plausibility(CAR), 10_000 * MS
+    at_limits = Measurement(steering_wheel_rad=0.05, brake_pedal_norm=0.05, accelerator_pedal_norm=0.05)
+    for k in range(60):
+        m = replace(at_limits, x_m=0.2 * (k >= 30), navigation_time_ms=BEGIN_MS + 10 * k)
+        assert not plausibility.update(now_ns + k * TICK_NS, m, Demand(0.0, 0.0, 0.0), True)
+
+
 # ---- steering
 
 
@@ -361,6 +376,9 @@ def test_an_angle_that_moves_impossibly_fast_is_found_at_once(sign):
         Finding(Cause.STEERING_IMPLAUSIBLE, pytest.approx(STEERING_LIMIT_RADPS, rel=1e-4), pytest.approx(34.875), "SR")
     ]
     assert len(steps_of_the_angle(0.0, sign, 0.0, sign)) == 3
+    exactly_rad = STEERING_LIMIT_RADPS * 0.02
+    assert exactly_rad / 0.02 == STEERING_LIMIT_RADPS
+    assert steps_of_the_angle(0.0, sign * exactly_rad, ticks=2) == []
 
 
 def test_the_first_angle_is_no_step():
@@ -505,6 +523,13 @@ def test_feet_count_only_while_driving_and_from_then_on(name):
 
 
 # ---- several at once
+
+
+def test_findings_of_the_same_tick_come_together():
+    drive = Drive().step(30)
+    drive.lie = lambda m: (shift("wheel_speed_radps", 20.0)(m), shift("steering_wheel_rad", 5.0 * (drive.tick == 41))(m))
+    drive.step(11)
+    assert drive.causes == [Cause.STEERING_IMPLAUSIBLE, Cause.SPEED_IMPLAUSIBLE]
 
 
 def test_findings_come_together():

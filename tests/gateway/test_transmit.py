@@ -1,10 +1,11 @@
 """The last line before the bus: what passes, and that nothing else does."""
 
 import random
+from dataclasses import replace
 
 import pytest
 
-from dbc.catalogue import load
+from dbc.catalogue import CatalogueError, load
 from dbc.frame import CanFrame
 from gateway.messages import Mode
 from gateway.transmit import MAX_FRAMES, RATE_CYCLES, TransmitGate
@@ -75,6 +76,19 @@ def test_of_2048_identifiers_and_9_lengths_only_the_listed_pass(mode):
 
 def test_the_list_is_what_the_gateway_sends_by_the_dbc():
     assert {spec.name for spec in OWN.values()} == {*ROBOTS, "GW_SafetyCommand", "GW_Heartbeat", "GW_Status"}
+
+
+@pytest.mark.req("S4")
+@pytest.mark.parametrize(("arbitration_id", "is_refused"), [(0x7DE, False), (0x7DF, True), (0x7E0, True), (0x7EF, True), (0x7F0, False)])
+def test_a_dbc_that_makes_the_gateway_diagnose_is_refused(arbitration_id, is_refused):
+    catalogue = load()
+    catalogue.by_name["GW_Heartbeat"] = replace(catalogue.by_name["GW_Heartbeat"], arbitration_id=arbitration_id)
+    if is_refused:
+        with pytest.raises(CatalogueError) as caught:
+            TransmitGate(catalogue)
+        assert str(caught.value) == f"message GW_Heartbeat (id 0x{arbitration_id:X}): 0x7DF and 0x7E0 to 0x7EF are for diagnosis"
+    else:
+        TransmitGate(catalogue)
 
 
 def test_100000_extended_identifiers_are_refused():

@@ -486,7 +486,7 @@ def test_the_limits_written_down_twice_are_the_same(name):
     angle_deg = min(math.degrees(profile.steering_wheel_limit_rad), 463.3)
     ours = (
         angle_deg, math.degrees(profile.steering_wheel_rate_radps), profile.lateral_acceleration_mps2, profile.lateral_jerk_mps3,
-        profile.acceleration_mps2, profile.deceleration_mps2, profile.drive_jerk_mps3, profile.brake_jerk_mps3, 3.6 * profile.max_speed_mps,
+        profile.acceleration_mps2, profile.deceleration_mps2, profile.drive_jerk_mps3, profile.brake_jerk_mps3, 3.6 * 1.1 * profile.max_speed_mps,
     )
     assert ours == pytest.approx(tuple(vars(envelope).values()), rel=0.01)
     assert set(ENVELOPES) == set(PROFILES)

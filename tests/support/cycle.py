@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.health import LinkHealth
+from dbc.traffic import Traffic
 from dbc.vehicle import FOCUS
 from gateway.core import TICK_NS
 from gateway.cycle import ControlCycle, Links
@@ -49,6 +50,9 @@ class StubBuses:
     def health(self):
         return {"robots": LinkHealth(), "navigation": LinkHealth()}
 
+    def traffic(self):
+        return {"robots": Traffic(0.25, {self._bench.preparation.catalogue.by_name["SR_Status"].arbitration_id: 100.0})}
+
     def recover(self):
         self.recoveries += 1
 
@@ -62,6 +66,7 @@ class CycleBench:
         self.now_ns = 1_000_000_000
         self.frames, self.states, self.replies, self.samples = [], [], [], []
         self.requests = deque()
+        self.plan_steer_rad = 0.0
         self.pulse, self.orders = Pulse(), Orders()
         self.pulse.realtime = realtime or {}
         self.buses = StubBuses(self)
@@ -111,8 +116,9 @@ class CycleBench:
     def _command(self, _):
         if not self.states or len(self.states) % 4:
             return None
-        plan = (0.0,) * HORIZON_STEPS
+        plan, steers = (0.0,) * HORIZON_STEPS, (self.plan_steer_rad,) * HORIZON_STEPS
         return ControlCommand(
             boot_id=7, seq=len(self.states), state_seq=self.states[-1].seq, t_ns=self.now_ns, status=CommandStatus.OK, solve_time_ns=0,
-            lateral_error_m=0.0, heading_error_rad=0.0, steer_rad=0.0, drive_norm=0.0, plan_steer_rad=plan, plan_drive_norm=plan,
+            lateral_error_m=0.0, heading_error_rad=0.0, steer_rad=self.plan_steer_rad, drive_norm=0.0,
+            plan_steer_rad=steers, plan_drive_norm=plan,
         )  # fmt: skip

@@ -228,13 +228,11 @@ class Rules:
         sure = {name for name in self.bad if self._sure(name)}
         worst = max((CONDITIONS[name].grade for name in sure if CONDITIONS[name].grade is not Grade.DRIVER), default=Grade.BLOCKS)
         drivers = [name for name in sure if CONDITIONS[name].grade is Grade.DRIVER]
-        # A stop that begins in the very tick in which the driver takes over ends in the next.
-        has_driver_settled = any(self._tick - self.bad[name] > 1 for name in drivers)
         forbidden = {
             Mode.READY: any(not CONDITIONS[name].is_for_engage_only for name in sure),
             Mode.ENGAGED: worst > Grade.BLOCKS or bool(drivers),
-            Mode.COMFORT_STOP: worst >= Grade.SAFE or has_driver_settled,
-            Mode.SAFE_STOP: worst >= Grade.FAULT or has_driver_settled,
+            Mode.COMFORT_STOP: worst >= Grade.SAFE or bool(drivers),
+            Mode.SAFE_STOP: worst >= Grade.FAULT or bool(drivers),
         }
         if forbidden.get(mode):
             self._complain(f"still {mode.name}")
@@ -243,10 +241,10 @@ class Rules:
         after, text = self.world.mode, " / ".join(reply.refusals)
         if not is_fresh and operation is not Operation.STOP and not reply.refusals:
             self._complain(f"a stale {operation.name} was granted")
+        if before is Mode.ENGAGED and after is Mode.ENGAGED and (operation is Operation.STOP or (operation is Operation.DISENGAGE and is_fresh)):
+            self._complain(f"{operation.name} did not act: {text}")
         if not is_fresh:
             return
-        if operation in (Operation.STOP, Operation.DISENGAGE) and before is Mode.ENGAGED and after is Mode.ENGAGED:
-            self._complain(f"{operation.name} did not act: {text}")
         wanted = {
             (Operation.ARM, Mode.SILENT): Mode.READY, (Operation.ARM, Mode.STANDBY): Mode.READY,
             (Operation.ENGAGE, Mode.READY): Mode.ENGAGED,
