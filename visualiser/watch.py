@@ -97,8 +97,20 @@ def _status_rows(status: StatusSample) -> list[Row]:
         ("Command age", f"{status.command_age_ms:.0f} ms", ""),
         ("Frames", f"{status.frames_received} received   {rejected} rejected", "yellow" if rejected else ""),
         ("Commands", f"{refused} rejected", "yellow" if refused else ""),
+        ("Limits", _limits_text(status), "yellow" if status.limits else ""),
+        ("Actuation", f"on a measurement {status.actuation_age_ms:.0f} ms old   largest {status.actuation_age_max_ms:.0f} ms", ""),
+        *([("Buses", _buses_text(status), "red" if status.dead_buses else "")] if status.buses else []),
         ("Ticks", f"{status.ticks}   {status.ticks_late} late   step {status.step_cpu_ms:.2f} ms CPU", ""),
     ]
+
+
+def _limits_text(status: StatusSample) -> str:
+    acted = "   ".join(f"{name} {limit.ticks}" for name, limit in status.limits.items())
+    return f"{status.profile}   held back {100 * status.limited_share:.1f} %   {acted}".rstrip()
+
+
+def _buses_text(status: StatusSample) -> str:
+    return "   ".join(f"{network} {state} {100 * status.bus_load.get(network, 0.0):.0f} %" for network, state in status.buses.items())
 
 
 def _age_rows(board: Board, now_ns: int) -> list[Row]:

@@ -211,7 +211,7 @@ def _again():
 
 def _after_restart():
     script = Script().engage()
-    script.oracle.mark_restart(script.now_ns)
+    script.oracle.mark_restart()
     return script.tick(1)
 
 

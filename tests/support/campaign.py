@@ -1,7 +1,7 @@
 """A gateway in virtual time between a car that follows its robots, a controller, an operator and a bus oracle that judges it.
 
-Nothing here happens on the ticks of the gateway alone: each message of the car, each command of the controller and each fault has a phase
-of its own within the tick. A world that drives can be copied, so that thousands of faults are tried from a handful of drives.
+Nothing here happens on the steps of the gateway alone: each message of the car, each command of the controller and each fault has a phase
+of its own, and the steps follow the commands as in the gateway's process. A world that drives can be copied, so that thousands of faults are tried from a handful of drives.
 """
 
 import copy
@@ -15,7 +15,8 @@ from dbc.vehicle import Vehicle, load_vehicle
 from gateway.conditions import UNDISTURBED, Surroundings
 from gateway.core import GatewayCore, StepOutput
 from gateway.limits import PROFILES
-from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, Mode, Operation, OperatorReply, OperatorRequest
+from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, Mode, Operation, OperatorReply, OperatorRequest, VehicleState
+from gateway.pacing import Pacer
 from tests.support.bus_oracle import BusOracle
 from tests.support.oracle_limits import REACTIONS
 from tests.support.robots import StubCar
@@ -63,15 +64,15 @@ class Controller:
         self.phase_ns = rng.randrange(CONTROL_PERIOD_NS)
         self.delay_ns = rng.randrange(2 * MS, 20 * MS)
 
-    def commands(self, since_ns: int, now_ns: int, output: StepOutput | None) -> list[tuple[int, ControlCommand]]:
+    def commands(self, since_ns: int, now_ns: int, state: VehicleState | None) -> list[tuple[int, ControlCommand]]:
         """Commands that are begun in (since, now], with the time at which they arrive."""
         begun_ns = since_ns - (since_ns - self.phase_ns) % CONTROL_PERIOD_NS + CONTROL_PERIOD_NS
-        if begun_ns > now_ns or output is None or not self.is_alive:
+        if begun_ns > now_ns or state is None or not self.is_alive:
             return []
         self.seq += 1
         plan_steer_rad = self.plan_steer_rad or (self.steer_rad,) * HORIZON_STEPS
         command = self.spoil(ControlCommand(
-            boot_id=self.boot_id, seq=self.seq, state_seq=output.state.seq, t_ns=begun_ns, status=self.status, solve_time_ns=self.delay_ns,
+            boot_id=self.boot_id, seq=self.seq, state_seq=state.seq, t_ns=begun_ns, status=self.status, solve_time_ns=self.delay_ns,
             lateral_error_m=self.lateral_error_m, heading_error_rad=self.heading_error_rad, steer_rad=self.steer_rad,
             drive_norm=self.drive_norm, plan_steer_rad=plan_steer_rad, plan_drive_norm=(self.drive_norm,) * HORIZON_STEPS,
         ))
@@ -88,6 +89,7 @@ class World:
     Attributes:
         taps: what the buses do to the car's frames now, each with the time from which on it does it.
         commands: on their way to the gateway, by time of arrival.
+        looks: how often the gateway looks at its buses between two steps.
         gap_until_ns: until then the gateway does not run.
         is_deaf: whether the car hears nothing of the gateway.
         watches: called after every tick until they answer True.
@@ -105,7 +107,8 @@ class World:
         self.oracle = BusOracle(profile)
         self.now_ns = 1_000_000 * MS + self.rng.randrange(1_000 * MS)
         self.phases = {spec.arbitration_id: self.rng.randrange(1, TICK_NS) for spec in catalogue().by_name.values()}
-        self.stamps_arrivals = self.rng.random() < 0.5  # else frames carry the time of the poll that fetched them
+        self.looks = self.rng.choice((0, 1, 4))
+        self.stamps_arrivals = self.rng.random() < 0.5  # else frames carry the time of the look that fetched them
         self.surroundings: Callable[[int], Surroundings] = lambda now_ns: UNDISTURBED
         self.taps: list[tuple[int, Tap]] = []
         self.strangers: Frames = []
@@ -118,7 +121,11 @@ class World:
         self.watches: list[Callable[[World], bool]] = []
         self.least_severity = 0
         self.output: StepOutput | None = None
+        self.state: VehicleState | None = None
         self.sent: list[CanFrame] = []
+        self.pacer = Pacer(self.now_ns, TICK_NS)
+        self._begun_ns = self._car_ns = self.now_ns
+        self._sent: Frames = []
         self._on_the_way: Frames = []
         self._request_seq = 0
 
@@ -161,7 +168,7 @@ class World:
 
     def sleep(self, duration_ns: int) -> None:
         """The gateway's process does not run, from now on."""
-        self.gap_until_ns = max(self.gap_until_ns, self.now_ns + duration_ns // TICK_NS * TICK_NS)
+        self.gap_until_ns = max(self.gap_until_ns, self.now_ns + duration_ns)
         self.oracle.mark_gap(self.now_ns, self.gap_until_ns)
 
     def ask(self, operation: Operation) -> None:
@@ -172,12 +179,14 @@ class World:
     def restart_gateway(self) -> None:
         """A new process in place of the old one."""
         self.core = new_core(self.profile, boot_id=self.rng.randrange(2, 1 << 31))
-        self.oracle.mark_restart(self.now_ns)
-        self.output, self.commands, self.gap_until_ns = None, [], 0
+        self.oracle.mark_restart()
+        self.output, self.state, self.commands, self.gap_until_ns = None, None, [], 0
+        self.pacer = Pacer(self.now_ns, TICK_NS)
 
     def run(self, duration_ns: int) -> "World":
-        """Let time pass, rounded up to whole ticks."""
-        for _ in range(-(-duration_ns // TICK_NS)):
+        """Let time pass, to the first step at or after its end."""
+        end_ns = self.now_ns + duration_ns
+        while self.now_ns < end_ns:
             self.tick()
         return self
 
@@ -189,18 +198,21 @@ class World:
         return self
 
     def tick(self) -> None:
-        """One period of the gateway: the car speaks, the gateway steps, the car hears."""
-        since_ns, self.now_ns = self.now_ns, self.now_ns + TICK_NS
-        self._speak(since_ns)
-        self.commands += self.controller.commands(since_ns, self.now_ns, self.output)
-        if self.now_ns < self.gap_until_ns:
+        """To the next step of the gateway: the buses carry what was sent, the gateway steps, the car hears."""
+        self._begin_commands(self.pacer.deadline_ns)
+        if self.now_ns + TICK_NS <= self.gap_until_ns - TICK_NS:
+            self.now_ns += TICK_NS
+            self._carry(self.now_ns)
             return
-        frames = self._arrived()
+        since_ns, self.now_ns = self.now_ns, max(self._next_step_ns(), self.gap_until_ns)
+        self.pacer.stepped(self.now_ns)
+        self._carry(self.now_ns)
+        frames = self._look(since_ns)
         request = self.requests.pop(0) if self.requests else None
         if request is not None:
             self.oracle.mark_request(self.now_ns, request.operation.name)
         self.output = self.core.step(self.now_ns, frames, self._newest_command(), request, self.surroundings(self.now_ns))
-        self.sent = self.output.frames
+        self.state, self.sent = self.output.state, self.output.frames
         if self.output.reply is not None:
             self.replies.append(self.output.reply)
         for frame in self.sent:
@@ -210,29 +222,60 @@ class World:
         if self.watches:
             self.watches = [watch for watch in self.watches if not watch(self)]
 
-    def _speak(self, since_ns: int) -> None:
-        """The frames of one cycle of the car go onto the buses, each at its phase, and through what disturbs them."""
-        frames = [(since_ns + self.phases[frame.arbitration_id], frame) for frame in self.car.speak(self.now_ns)]
+    def _begin_commands(self, until_ns: int) -> None:
+        """What the controller begins until then."""
+        if until_ns > self._begun_ns:
+            self.commands += self.controller.commands(self._begun_ns, until_ns, self.state)
+            self._begun_ns = until_ns
+
+    def _next_step_ns(self) -> int:
+        """When the gateway steps, as its process decides: at the deadline, or with a command shortly before it."""
+        for arrival_ns in sorted(t_ns for t_ns, _ in self.commands):
+            if arrival_ns >= self.pacer.deadline_ns:
+                break
+            self.pacer.command_arrived(arrival_ns)
+            if self.pacer.is_due(arrival_ns, has_command=True):
+                return arrival_ns
+        return self.pacer.deadline_ns
+
+    def _carry(self, until_ns: int) -> None:
+        """The car speaks every 10 ms, each message at its phase; what is sent by then goes through whatever disturbs the buses."""
+        while self._car_ns < until_ns:
+            self._sent += [(self._car_ns + self.phases[frame.arbitration_id], frame) for frame in self.car.speak(self._car_ns)]
+            self._car_ns += TICK_NS
+        frames = [entry for entry in self._sent if entry[0] <= until_ns]
+        self._sent = [entry for entry in self._sent if entry[0] > until_ns]
         for start_ns, tap in self.taps:
             frames = [
                 arrival for t_ns, frame in frames for arrival in (tap(t_ns, frame, self.rng) if t_ns >= start_ns else [(t_ns, frame)])
             ]
-        self._on_the_way += frames
-        if self.strangers:
-            self._on_the_way += self.strangers
-            self.strangers = []
+        self._on_the_way += frames + self.strangers
+        self.strangers = []
+
+    def _look(self, since_ns: int) -> list[CanFrame]:
+        """What has come by now, in its order; of it the gateway has already seen what came before one of its looks between two steps."""
+        frames = self._arrived()
+        for k in range(1, self.looks + 1):
+            look_ns = since_ns + k * (self.now_ns - since_ns) // (self.looks + 1)
+            seen = [frame for frame in frames if frame.t_ns <= look_ns]
+            if seen:
+                self.state = self.core.sense(look_ns, [self._stamped(frame, look_ns) for frame in seen]) or self.state
+                frames = frames[len(seen) :]
+        return [self._stamped(frame, self.now_ns) for frame in frames]
 
     def _arrived(self) -> list[CanFrame]:
-        """Frames that are there by now, in the order of their arrival."""
-        now_ns = self.now_ns
-        arrived = sorted((entry for entry in self._on_the_way if entry[0] <= now_ns), key=_time_of)
-        self._on_the_way = [entry for entry in self._on_the_way if entry[0] > now_ns]
-        own = catalogue().by_id
+        """Frames that are there by now, in the order of their arrival, with its time."""
+        arrived = sorted((entry for entry in self._on_the_way if entry[0] <= self.now_ns), key=_time_of)
+        self._on_the_way = [entry for entry in self._on_the_way if entry[0] > self.now_ns]
+        known = catalogue().by_id
         for t_ns, frame in arrived:
-            spec = own.get(frame.arbitration_id)
+            spec = known.get(frame.arbitration_id)
             if spec is not None and spec.sender != "GW":
                 self.oracle.observe(t_ns, spec.network, frame.arbitration_id, frame.data, is_from_gateway=False)
-        return [CanFrame(frame.arbitration_id, frame.data, t_ns if self.stamps_arrivals else now_ns) for t_ns, frame in arrived]
+        return [frame._replace(t_ns=t_ns) for t_ns, frame in arrived]
+
+    def _stamped(self, frame: CanFrame, look_ns: int) -> CanFrame:
+        return frame if self.stamps_arrivals else frame._replace(t_ns=look_ns)
 
     def _newest_command(self) -> ControlCommand | None:
         """The channel keeps the newest datagram only."""

@@ -12,7 +12,7 @@ from functools import cache
 from dbc.frame import CanFrame
 from dbc.health import BusState, LinkHealth
 from gateway.conditions import Surroundings
-from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand
+from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, VehicleState
 from tests.support.campaign import MS, TICK_NS, Frames, Tap, World, catalogue
 from tests.support.oracle_wire import Wire, WireMessage, counter_of
 
@@ -237,17 +237,17 @@ def second_controller(world: World) -> None:
     phase_ns = (world.controller.phase_ns + world.rng.randrange(12 * MS, 28 * MS)) % (40 * MS)
     own = world.controller.commands
 
-    def both(since_ns: int, now_ns: int, output: object) -> list[tuple[int, ControlCommand]]:
-        commands = own(since_ns, now_ns, output)  # type: ignore[arg-type]
+    def both(since_ns: int, now_ns: int, state: VehicleState | None) -> list[tuple[int, ControlCommand]]:
+        commands = own(since_ns, now_ns, state)
         begun_ns = since_ns - (since_ns - phase_ns) % (40 * MS) + 40 * MS
-        if begun_ns <= now_ns and world.output is not None:
+        if begun_ns <= now_ns and state is not None:
             strangers[0] += 1
             plan = (0.3,) * HORIZON_STEPS
             arrival_ns = begun_ns + world.controller.delay_ns
             if strangers[0] == 3:
                 world.mark(arrival_ns, "F5")
             commands.append((arrival_ns, ControlCommand(
-                4711, strangers[0], world.output.state.seq, begun_ns, CommandStatus.OK, 0, 0.0, 0.0, 0.3, 1.0, plan, (1.0,) * HORIZON_STEPS
+                4711, strangers[0], state.seq, begun_ns, CommandStatus.OK, 0, 0.0, 0.0, 0.3, 1.0, plan, (1.0,) * HORIZON_STEPS
             )))
         return commands
 

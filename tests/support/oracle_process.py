@@ -21,7 +21,7 @@ import can
 
 from tests.support.bus_oracle import BusOracle
 from tests.support.oracle_limits import ENVELOPES, MS
-from tests.support.oracle_wire import GATEWAY, Wire
+from tests.support.oracle_wire import Wire
 
 HOLD_BACK_NS = 100 * MS
 """Frames wait this long, so that those of two buses and what standard input tells are judged in the order of their times."""
@@ -103,7 +103,7 @@ class Judge:
         elif "request" in told:
             self._oracle.mark_request(t_ns, told["request"])
         elif "restart" in told:
-            self._oracle.mark_restart(t_ns)
+            self._oracle.mark_restart()
 
     def _report(self) -> None:
         for violation in self._oracle.violations[self._reported :]:
