@@ -203,7 +203,7 @@ class GatewayCore:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
         if refused := untimely(request, situation.now_ns, self._last_request_ns):
             return [refused]
-        self._last_request_ns = max(request.t_ns, self._last_request_ns)
+        self._last_request_ns = max(min(request.t_ns, situation.now_ns), self._last_request_ns)  # a STOP may be of any time
         trigger = _TRIGGER_OF_OPERATION.get(request.operation) or REACTIONS[_CAUSE_OF_OPERATION[request.operation]]
         if (self.mode, trigger) not in TRANSITIONS:
             return [f"not possible in {self.mode.name}"]
