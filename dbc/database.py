@@ -1,6 +1,7 @@
 """One DBC file as it is read: its messages, the bus that it is about, and its hash."""
 
 import hashlib
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,18 @@ ROBOTS, NAVIGATION = NETWORKS = ("robots", "navigation")
 
 _DEFAULT_BITRATE_BPS = 500_000
 _MAX_BITRATE_BPS = 1_000_000
+_MAX_FILE_BYTES = 16_000_000
+_MAX_PAGES = 65_536
+_SHOWN = 30
+_TEXT = re.compile(r'"(?:[^"\\]|\\.)*"')
+_ABSURD_NUMBER = re.compile(
+    r"\b\d[\d.]*[eE][+-]?\d{4,}"  # an exponent of more than three digits
+    r"|\b\d{6,}\s*\||\|\s*\d{6,}\s*@"  # start and length of a signal
+    r"|^[ \t]*BO_\s+\d+\s+\w+\s*:\s*\d{6,}",  # length of a message
+    re.MULTILINE,
+)
+_PAGES = re.compile(r"^[ \t]*SG_MUL_VAL_\s[^;]*", re.MULTILINE)
+_PAGE_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 
 
 class CatalogueError(UserMistake):
@@ -52,7 +65,9 @@ def read_dbc(path: Path, is_strict: bool = True) -> DbcFile:
     """
     try:
         content = path.read_bytes()
-        database = cantools.database.load_string(content.decode("latin-1"), database_format="dbc", strict=is_strict)
+        text = content.decode("latin-1")
+        _refuse_absurd(path, text)
+        database = cantools.database.load_string(text, database_format="dbc", strict=is_strict)
     except OSError as error:
         raise CatalogueError(f"{path}: {error.strerror or error}") from error
     except (CantoolsError, ValueError) as error:
@@ -60,6 +75,23 @@ def read_dbc(path: Path, is_strict: bool = True) -> DbcFile:
     assert isinstance(database, Database)
     network, bitrate_bps = _network_of(path, database)
     return DbcFile(path, hashlib.sha256(content).hexdigest(), network, bitrate_bps, tuple(database.messages))
+
+
+def _refuse_absurd(path: Path, text: str) -> None:
+    """Numbers for which the parser would take all memory, or years: it counts bits and pages one by one, and expands exponents.
+
+    Raises:
+        CatalogueError: there is one.
+    """
+    if len(text) > _MAX_FILE_BYTES:
+        raise CatalogueError(f"{path}: {len(text)} bytes: allowed: up to {_MAX_FILE_BYTES}")
+    outside_texts = _TEXT.sub('""', text)
+    if found := _ABSURD_NUMBER.search(outside_texts):
+        raise CatalogueError(f"{path}: not a usable DBC: number too large: {found[0].strip()[:_SHOWN]}")
+    for line in _PAGES.findall(outside_texts):
+        for first, last in _PAGE_RANGE.findall(line):
+            if max(len(first), len(last)) > _SHOWN or int(last) - int(first) >= _MAX_PAGES:
+                raise CatalogueError(f"{path}: not a usable DBC: more than {_MAX_PAGES} pages: {first[:_SHOWN]}-{last[:_SHOWN]}")
 
 
 def bitrates(files: Iterable[DbcFile]) -> dict[str, int]:

@@ -4,6 +4,7 @@ The rules read files that a catalogue would refuse, so that all mistakes are tol
 here: who asks brings the figures, see `BusTiming`.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ DEFAULT_MAX_LOAD = 0.6
 """Share of a bus that its cyclic messages may take: the rest is for retransmission, diagnosis and what is to come."""
 
 _NS_PER_MS = 1e6
+_MAX_SIGNAL_BITS = 8 * MAX_LENGTH_BYTES
 
 
 class Severity(Enum):
@@ -144,6 +146,12 @@ def _ranges(place: _Place) -> Iterator[Found]:
     for signal in place.message.signals:
         if signal.scale == 0:
             yield Severity.ERROR, signal.name, "has one value only", "factor 0", "another factor"
+            continue
+        if signal.length > _MAX_SIGNAL_BITS:
+            yield Severity.ERROR, signal.name, "longer than a classical frame", f"{signal.length} bits", f"{_MAX_SIGNAL_BITS} bits"
+            continue
+        if not (math.isfinite(signal.scale) and math.isfinite(signal.offset)):
+            yield Severity.ERROR, signal.name, "factor or offset is no number", f"({signal.scale:g},{signal.offset:g})", "finite numbers"
             continue
         low, high = value_range(signal)
         stated = f"[{_number(signal.minimum)}|{_number(signal.maximum)}]"

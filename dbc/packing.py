@@ -76,7 +76,7 @@ def value_range(signal: Signal) -> tuple[float, float]:
 def pages_of(message: Message, signal: Signal) -> dict[str, list[int]]:
     """The multiplexers that decide whether a signal is there, each with its values that bring it; none for one that always is."""
     pages: dict[str, list[int]] = {}
-    while signal.multiplexer_ids:
+    while signal.multiplexer_ids and signal.multiplexer_signal not in pages:  # a damaged file may have them in a circle
         assert signal.multiplexer_signal is not None
         pages[signal.multiplexer_signal] = signal.multiplexer_ids
         signal = message.get_signal_by_name(signal.multiplexer_signal)

@@ -45,8 +45,7 @@ class CommandGate:
         self.bad_in_a_row = 0
         self.strangers = 0
         self.last_cause = ""
-        self._boot_id: int | None = None
-        self._last_seq = -1
+        self._last: ControlCommand | None = None
         self._admitted_ns: int | None = None
 
     def offer(self, now_ns: int, command: ControlCommand, state_seq: int) -> bool:
@@ -66,7 +65,7 @@ class CommandGate:
             self.good_in_a_row = 0
             return False
         self.bad_in_a_row = 0
-        self._boot_id, self._last_seq, self._admitted_ns = command.boot_id, command.seq, now_ns
+        self._last, self._admitted_ns = command, now_ns
         self.status = command.status
         self.good_in_a_row = self.good_in_a_row + 1 if command.status is CommandStatus.OK else 0
         self.degraded_in_a_row = self.degraded_in_a_row + 1 if command.status is CommandStatus.DEGRADED else 0
@@ -79,13 +78,14 @@ class CommandGate:
         return NEVER_NS if self._admitted_ns is None else now_ns - self._admitted_ns
 
     def _reject_cause(self, now_ns: int, command: ControlCommand, state_seq: int) -> str | None:
+        last = self._last
         causes = (
-            (_SECOND_SENDER, self._boot_id is not None and command.boot_id != self._boot_id),
-            ("repeated or old sequence number", command.boot_id == self._boot_id and command.seq <= self._last_seq),
+            (_SECOND_SENDER, last is not None and command.boot_id != last.boot_id),
+            ("repeated or old sequence number", last is not None and command.seq <= last.seq),
             ("answers an old state", not state_seq - MAX_STATE_LAG <= command.state_seq <= state_seq),
             ("time of another clock", abs(command.t_ns - now_ns) > MAX_CLOCK_OFFSET_NS),
             ("steering out of range", not all(abs(steer) <= STEER_RANGE_RAD for steer in (command.steer_rad, *command.plan_steer_rad))),
             ("drive out of range", not all(abs(drive) <= DRIVE_RANGE_NORM for drive in (command.drive_norm, *command.plan_drive_norm))),
-            ("path error is no number", not math.isfinite(command.lateral_error_m + command.heading_error_rad)),
+            ("path error is no number", not (math.isfinite(command.lateral_error_m) and math.isfinite(command.heading_error_rad))),
         )
         return next((name for name, is_true in causes if is_true), None)

@@ -206,7 +206,7 @@ def blockers(s: Situation, found: Sequence[Finding]) -> list[str]:
         (not s.surroundings.is_recording, "recorder does not record"),
         (
             s.surroundings.disk_free_share < MIN_DISK_FREE,
-            f"{100 * s.surroundings.disk_free_share:.1f} % of the record's disk free, {100 * MIN_DISK_FREE:.0f} % needed",
+            f"{100 * s.surroundings.disk_free_share:.1f} % of the record's disk free, {100 * MIN_DISK_FREE:.1f} % needed",
         ),
     )
     blocked = [str(finding) for finding in found] + [name for is_true, name in conditions if is_true]

@@ -48,8 +48,8 @@ class Pacer:
     def stepped(self, now_ns: int) -> None:
         """Set the next deadline after a step that was due at `now_ns`."""
         self._is_shifted = False
-        skipped = max(0, now_ns - self.deadline_ns) // self._period_ns
+        pulled_to_ns = min(now_ns, self.deadline_ns)
+        skipped = (now_ns - pulled_to_ns) // self._period_ns
         self.overruns += skipped
         is_flowing = self._last_command_ns is not None and now_ns - self._last_command_ns < FLOW_NS
-        pulled_to_ns = min(now_ns, self.deadline_ns)
         self.deadline_ns = pulled_to_ns + (skipped + 1) * self._period_ns + (DRIFT_NS if is_flowing else 0)

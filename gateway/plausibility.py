@@ -42,6 +42,9 @@ PEDAL_LIMIT_NORM = 0.05
 """A foot that is deeper than the robot by so much of the stroke wants to be: the robots judge by the same figure."""
 PEDAL_HOLD_NS = 100_000_000
 """As Dataspeed: an override has a level and a time."""
+PEDAL_WINDOW_NS = 300_000_000
+"""A pedal that is no deeper than the robot was asked for within this time is no foot, whatever the robot says of itself: a status
+that stands still while the robot brakes must not hand a moving car to nobody. The slowest stroke of the robots takes 0.2 s."""
 
 _NS_PER_S = 1e9
 
@@ -126,6 +129,7 @@ class Plausibility:
         self._motion = _Motion()
         self._steered: tuple[int, float] | None = None
         self._demands_rad: deque[tuple[int, float]] = deque()
+        self._pedal_demands: deque[tuple[int, float, float]] = deque()
         self._speed = _Held(SPEED_HOLD_NS)
         self._position, self._yaw_rate = _Held(MOTION_HOLD_NS), _Held(MOTION_HOLD_NS)
         self._following = _Held(FOLLOWING_HOLD_NS)
@@ -141,6 +145,9 @@ class Plausibility:
         self._demands_rad.append((now_ns, demand.steering_wheel_rad))
         while now_ns - self._demands_rad[0][0] > self._following_ns:
             self._demands_rad.popleft()
+        self._pedal_demands.append((now_ns, demand.accelerator_norm, demand.brake_norm))
+        while now_ns - self._pedal_demands[0][0] > PEDAL_WINDOW_NS:
+            self._pedal_demands.popleft()
         found = self._judge_steering_rate(now_ns, measurement)
         if measurement.navigation_time_ms >= 0:
             found += self._judge_navigation(now_ns, measurement)
@@ -187,9 +194,11 @@ class Plausibility:
         return [Finding(Cause.STEERING_NOT_FOLLOWING, error_rad, FOLLOWING_LIMIT_RAD, "SR")]
 
     def _judge_pedals(self, now_ns: int, m: Measurement) -> list[Finding]:
+        asked_accelerator_norm = max(accelerator_norm for _, accelerator_norm, _ in self._pedal_demands)
+        asked_brake_norm = max(brake_norm for *_, brake_norm in self._pedal_demands)
         feet = (
-            (self._brake, Cause.DRIVER_BRAKES, m.brake_pedal_norm - m.brake_norm),
-            (self._accelerator, Cause.DRIVER_ACCELERATES, m.accelerator_pedal_norm - m.accelerator_norm),
+            (self._brake, Cause.DRIVER_BRAKES, m.brake_pedal_norm - max(m.brake_norm, asked_brake_norm)),
+            (self._accelerator, Cause.DRIVER_ACCELERATES, m.accelerator_pedal_norm - max(m.accelerator_norm, asked_accelerator_norm)),
         )
         return [
             Finding(cause, deeper_norm, PEDAL_LIMIT_NORM, "CAR_Powertrain")

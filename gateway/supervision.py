@@ -42,8 +42,7 @@ class MessageWatch:
         self.last_good_ns: int | None = None
         self._receiver = None if spec.e2e_data_id is None else E2EReceiver(spec.e2e_data_id)
         self._window = 0
-        self._last_bad_ns = 0
-        self._is_invalid = False
+        self._invalid_until_ns: int | None = None
 
     def reject_cause(self, frame: CanFrame) -> str | None:
         """Why a frame must not be decoded; None when it may."""
@@ -59,8 +58,8 @@ class MessageWatch:
         if is_good:
             self.last_good_ns = t_ns
             return
-        self._last_bad_ns = t_ns
-        self._is_invalid = self._is_invalid or self.bad_frames > MAX_BAD_FRAMES
+        if self._invalid_until_ns is not None or self.bad_frames > MAX_BAD_FRAMES:
+            self._invalid_until_ns = t_ns + RECOVERY_NS
 
     @property
     def bad_frames(self) -> int:
@@ -73,9 +72,9 @@ class MessageWatch:
         age_ns = spec.timeout_ns + 1 if self.last_good_ns is None else now_ns - self.last_good_ns
         if age_ns > spec.timeout_ns:
             return Finding(Cause.MESSAGE_MISSING, age_ns * _MS_PER_NS, spec.timeout_ns * _MS_PER_NS, spec.name)
-        if self._is_invalid and now_ns - self._last_bad_ns <= RECOVERY_NS:
+        if self._invalid_until_ns is not None and now_ns <= self._invalid_until_ns:
             return Finding(Cause.MESSAGE_INVALID, self.bad_frames, MAX_BAD_FRAMES, spec.name)
-        self._is_invalid = False
+        self._invalid_until_ns = None
         return None
 
 
@@ -87,24 +86,26 @@ class Flow:
     """
 
     def __init__(self, specs: Iterable[MessageSpec]) -> None:
-        cycles_ns = [spec.cycle_time_ns for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS]
-        self._frames_per_ns = sum(1.0 / cycle_ns for cycle_ns in cycles_ns)
+        cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if spec.cycle_time_ns and spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS}
+        self._names = cycles_ns.keys()
+        self._frames_per_ns = sum(1.0 / cycle_ns for cycle_ns in cycles_ns.values())
         self._jitter_frames = len(cycles_ns)  # one of each message may just be on its way
         self._good = 0
-        self._history: deque[tuple[int, int]] = deque()
+        self._before: tuple[int, int] | None = None
+        self._within: deque[tuple[int, int]] = deque()
 
     def note_good(self, spec: MessageSpec) -> None:
         """Count a good frame."""
-        self._good += spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS
+        self._good += spec.name in self._names
 
     def finding(self, now_ns: int) -> Finding | None:
         """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
-        self._history.append((now_ns, self._good))
-        while len(self._history) > 1 and self._history[1][0] <= now_ns - FLOW_WINDOW_NS:
-            self._history.popleft()
-        then_ns, good_then = self._history[0]
-        if now_ns - then_ns < FLOW_WINDOW_NS:
+        self._within.append((now_ns, self._good))
+        while self._within[0][0] <= now_ns - FLOW_WINDOW_NS:
+            self._before = self._within.popleft()
+        if self._before is None:
             return None
+        then_ns, good_then = self._before
         expected = (now_ns - then_ns) * self._frames_per_ns
         lost = expected - (self._good - good_then)
         limit = self._jitter_frames + MAX_LOST_FRAMES

@@ -7,6 +7,8 @@ import pytest
 from dbc.catalogue import ROBOTS_DBC, CatalogueError, DecodeError, EncodeError, load
 from dbc.database import read_dbc
 from dbc.frame import CanFrame
+from dbc.lint import lint
+from dbc.packing import pages_of
 
 CATALOGUE = load()
 SITE_DBC = 'VERSION ""\nBU_: A\nBO_ 1 X: 8 A\n SG_ S : 0|8@1+ (1,0) [0|255] "" A\n'
@@ -193,6 +195,49 @@ def test_overlapping_signals_are_read_where_asked_for(tmp_path):
     assert [signal.name for signal in read_dbc(path, is_strict=False).messages[0].signals] == ["S", "T"]
     with pytest.raises(CatalogueError, match="overlapping"):
         read_dbc(path)
+
+
+MULTIPLEXED = ("M M : 0|8@1+ (1,0) [0|0]", "S m0 : 8|8@1+ (1,0) [0|0]")
+
+
+@pytest.mark.parametrize("is_strict", [True, False])
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (message("S : 0|99999999999@1+ (1,0) [0|0]"), r"number too large: \|99999999999@$"),
+        (message("S : 7|999999@0+ (1,0) [0|0]"), r"number too large: \|999999@$"),
+        (message("S : 100000|8@1+ (1,0) [0|0]"), r"number too large: 100000\|$"),
+        (message(length=100000), r"number too large: BO_ 1 X: 100000$"),
+        (message() + 'BA_DEF_ "B" INT 0 1e9999999;\n', r"number too large: 1e9999999$"),
+        (message() + 'BA_DEF_ "B" INT 0 1.5E+1000;\n', r"number too large: 1\.5E\+1000$"),
+        (message(*MULTIPLEXED) + "SG_MUL_VAL_ 1 S M 0-65536;\n", r"more than 65536 pages: 0-65536$"),
+        (message(*MULTIPLEXED) + f"SG_MUL_VAL_ 1 S M 3-3, 0-{'9' * 9999};\n", r"more than 65536 pages: 0-9{30}$"),
+        ("x" * 16_000_001, r"16000001 bytes: allowed: up to 16000000$"),
+    ],
+)
+def test_a_file_that_would_take_all_memory_is_refused_before_it_is_parsed(tmp_path, content, named, is_strict):
+    path = written(tmp_path, content)
+    with pytest.raises(CatalogueError, match=named) as caught:
+        read_dbc(path, is_strict)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert len(str(caught.value)) < len(str(path)) + 100
+
+
+def test_large_numbers_that_mean_something_are_read(tmp_path):
+    pages = message(*MULTIPLEXED) + "SG_MUL_VAL_ 1 S M 0-65535;\n"
+    assert len(read_dbc(written(tmp_path, pages)).messages[0].signals[1].multiplexer_ids) == 65536
+    single = message(*MULTIPLEXED) + "SG_MUL_VAL_ 1 S M 4294967295-4294967295;\n"
+    assert read_dbc(written(tmp_path, single)).messages[0].signals[1].multiplexer_ids == [4294967295]
+    texts = message("S1e12345 : 0|8@1+ (1e-300,0) [0|0]") + 'CM_ "Revision 5e12345, \\"0|999999@\\"";\n'
+    assert read_dbc(written(tmp_path, texts)).messages[0].signals[0].scale == 1e-300
+    assert read_dbc(written(tmp_path, message(length=8) + " " * 15_999_000)).messages[0].length == 8
+
+
+def test_pages_in_a_circle_end(tmp_path):
+    circle = message("M m0M : 0|8@1+ (1,0) [0|0]", "N m0M : 8|8@1+ (1,0) [0|0]") + "SG_MUL_VAL_ 1 N M 0-0;\nSG_MUL_VAL_ 1 M N 0-0;\n"
+    file = read_dbc(written(tmp_path, circle), is_strict=False)
+    assert [pages_of(file.messages[0], signal) for signal in file.messages[0].signals] == [{"N": [0], "M": [0]}, {"M": [0], "N": [0]}]
+    assert lint([file]) != []
 
 
 def test_a_damaged_file_is_refused_or_read_and_nothing_else(tmp_path):

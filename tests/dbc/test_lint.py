@@ -96,11 +96,21 @@ def test_a_signal_that_is_there_twice(tmp_path):
         ("S : 0|8@1+ (1,0) [5|5]", []),
         ("S : 0|8@1+ (1,0) [6|5]", [error("range is empty", "[6|5]", "minimum below maximum", "S")]),
         ("S : 0|8@1+ (1,0) [0|0]", [warning("states no range", "[|]", "[0|255]", "S")]),
+        ("S : 0|8@1+ (1e400,0) [0|9]", [error("factor or offset is no number", "(inf,0)", "finite numbers", "S")]),
+        ("S : 0|8@1+ (1,-1e400) [0|9]", [error("factor or offset is no number", "(1,-inf)", "finite numbers", "S")]),
+        ("S : 0|64@1+ (1,0) [0|9]", []),
         ("S : 0|8@1+ (0,1) [1|1]", [error("has one value only", "factor 0", "another factor", "S")]),
     ],
 )
 def test_ranges(tmp_path, signal, expected):
     assert findings(tmp_path, message(signal)) == expected
+
+
+def test_a_signal_longer_than_a_frame(tmp_path):
+    found = findings(tmp_path, message("S : 0|65@1+ (1,0) [0|9]", length=9))
+    expected = [error("longer than a classical frame", "9 bytes", "8 bytes"), error("longer than a classical frame", "65 bits", "64 bits", "S")]
+    assert found == expected
+    assert error("longer than a classical frame", "99999 bits", "64 bits", "S") in findings(tmp_path, message("S : 0|99999@1+ (0.5,0) [0|9]"))
 
 
 def test_value_tables(tmp_path):

@@ -68,6 +68,7 @@ def test_a_good_command_is_admitted():
         ({"drive_norm": -1.001 * DRIVE_RANGE_NORM}, "drive out of range"),
         ({"lateral_error_m": math.nan}, "path error is no number"),
         ({"heading_error_rad": math.inf}, "path error is no number"),
+        ({"lateral_error_m": -math.inf}, "path error is no number"),
         ({"plan_drive_norm": with_last(LEVEL, DRIVE_RANGE_NORM * 1.001)}, "drive out of range"),
         ({"plan_drive_norm": with_last(LEVEL, -DRIVE_RANGE_NORM * 1.001)}, "drive out of range"),
     ],

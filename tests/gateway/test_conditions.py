@@ -181,7 +181,7 @@ BLOCKING = [
     (
         {"surroundings": Surroundings(disk_free_share=0.07)},
         {"surroundings": Surroundings(disk_free_share=0.069)},
-        "6.9 % of the record's disk free, 7 % needed",
+        "6.9 % of the record's disk free, 7.0 % needed",
     ),
     ({}, with_link(state=BusState.ERROR_WARNING), "bus navigation is error-warning"),
     ({}, with_link(state=BusState.ERROR_PASSIVE), "bus navigation is error-passive"),

@@ -3,7 +3,7 @@
 import random
 from itertools import pairwise
 
-from gateway.pacing import DRIFT_NS, PULL_NS, SHIFT_NS, Pacer
+from gateway.pacing import DRIFT_NS, FLOW_NS, PULL_NS, SHIFT_NS, Pacer
 
 MS = 1_000_000
 PERIOD_NS = 10 * MS
@@ -66,3 +66,39 @@ def test_a_stall_is_skipped_and_counted():
     pacer, steps, _ = run(1.0, [], stall=(95 * MS, 345 * MS))
     assert pacer.overruns == 24
     assert [step for step in steps if step >= 90 * MS][:4] == [90 * MS, 345 * MS, 350 * MS, 360 * MS]
+
+
+def test_a_step_is_due_at_its_deadline_and_for_a_command_a_pull_before_it():
+    pacer = Pacer(5, PERIOD_NS)
+    due_ns = 5 + PERIOD_NS
+    assert pacer.deadline_ns == due_ns
+    assert [pacer.is_due(due_ns - 1, False), pacer.is_due(due_ns, False)] == [False, True]
+    assert [pacer.is_due(due_ns - PULL_NS - 1, True), pacer.is_due(due_ns - PULL_NS, True)] == [False, True]
+
+
+def test_commands_at_the_wrong_time_shift_a_step_once_a_period():
+    pacer = Pacer(0, PERIOD_NS)
+    for k in range(2):
+        deadline_ns = pacer.deadline_ns
+        pacer.command_arrived(deadline_ns - PULL_NS)
+        assert pacer.deadline_ns == deadline_ns, k  # in time: it pulls the step to itself
+        for early_ns in (1, 2, 3):
+            pacer.command_arrived(deadline_ns - PULL_NS - early_ns)
+            assert pacer.deadline_ns == deadline_ns + SHIFT_NS, k
+        pacer.stepped(pacer.deadline_ns)
+
+
+def test_the_periods_are_longer_while_commands_come():
+    for since_ns, drift_ns in ((FLOW_NS - 1, DRIFT_NS), (FLOW_NS, 0)):
+        pacer = Pacer(0, PERIOD_NS)
+        pacer.command_arrived(PERIOD_NS)
+        pacer.deadline_ns = PERIOD_NS + since_ns
+        pacer.stepped(PERIOD_NS + since_ns)
+        assert pacer.deadline_ns == PERIOD_NS + since_ns + PERIOD_NS + drift_ns
+
+
+def test_a_whole_period_late_is_one_overrun_and_the_grid_stays():
+    for late_ns, overruns in ((PERIOD_NS - 1, 0), (PERIOD_NS, 1), (3 * PERIOD_NS - 1, 2)):
+        pacer = Pacer(0, PERIOD_NS)
+        pacer.stepped(PERIOD_NS + late_ns)
+        assert (pacer.overruns, pacer.deadline_ns) == (overruns, (2 + overruns) * PERIOD_NS)

@@ -537,3 +537,23 @@ def test_findings_come_together():
     drive.lie = lambda m: (shift("wheel_speed_radps", 20.0)(m), shift("brake_pedal_norm", 0.5)(m))
     assert drive.until_found() == 100 * MS
     assert drive.causes == [Cause.SPEED_IMPLAUSIBLE, Cause.DRIVER_BRAKES]
+
+
+@pytest.mark.req("F6", "E3")
+@pytest.mark.parametrize(
+    ("pedal", "demand", "cause"),
+    [
+        ("brake_pedal_norm", Demand(0.0, 0.0, 0.1), Cause.DRIVER_BRAKES),
+        ("accelerator_pedal_norm", Demand(0.0, 0.1, 0.0), Cause.DRIVER_ACCELERATES),
+    ],
+)
+def test_a_pedal_that_the_gateway_presses_is_no_foot_even_when_the_robot_denies_it(pedal, demand, cause):
+    judge, measured = Plausibility(CAR), Measurement(**{pedal: 0.1})
+
+    def until(now_ms, start_ms, asked):
+        found = [judge.update(t_ms * 1_000_000, measured, asked, is_driving=True) for t_ms in range(start_ms, now_ms, 10)]
+        return [finding.cause for findings in found for finding in findings]
+
+    assert cause not in until(1_000, 0, demand)
+    assert cause not in until(1_390, 1_000, Demand(0.0, 0.0, 0.0))  # 300 ms since it was asked for, 100 ms of patience
+    assert cause in until(1_420, 1_390, Demand(0.0, 0.0, 0.0))

@@ -1,6 +1,7 @@
 """Judgement on frames, and on those that are missing."""
 
 import random
+from dataclasses import replace
 
 import pytest
 
@@ -8,7 +9,7 @@ from dbc.catalogue import load
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from gateway.causes import Cause, Finding
-from gateway.supervision import MAX_BAD_FRAMES, MAX_LOST_FRAMES, RECOVERY_NS, WINDOW_FRAMES, Supervisor
+from gateway.supervision import MAX_BAD_FRAMES, MAX_LOST_FRAMES, RECOVERY_NS, WINDOW_FRAMES, Flow, Supervisor
 
 CATALOGUE = load()
 MS = 1_000_000
@@ -131,12 +132,36 @@ def test_bad_frames_that_lie_far_apart_are_only_counted():
     assert watching.rejected == {"SR_Status: wrong crc": 20}
 
 
+@pytest.mark.req("F7")
+@pytest.mark.parametrize(("last", "is_invalid"), [(WINDOW_FRAMES - 1, True), (WINDOW_FRAMES, False)])
+def test_three_bad_frames_count_together_when_ten_frames_hold_them(last, is_invalid):
+    watching, sender, position = supervisor(), Sender(), Sender("PosLocal")
+    sender.frame(0)
+    watching.observe([sender.frame(0)])
+    for k in range(WINDOW_FRAMES + 1):
+        t_ns = k * 10 * MS
+        watching.observe([sender.bad(t_ns) if k in (0, 4, last) else sender.frame(t_ns), position.frame(t_ns)])
+    assert causes(watching.findings(t_ns)) == ({(Cause.MESSAGE_INVALID, "SR_Status")} if is_invalid else set())
+
+
+def test_a_message_without_a_cycle_is_neither_expected_nor_counted_among_those_that_are():
+    specs = [CATALOGUE.by_name[name] for name in FAST]
+    event = replace(STATUS, name="Event", cycle_time_ns=0)
+    flow = Flow([*specs, event])
+    for k in range(20):
+        for _ in range(100):
+            flow.note_good(event)
+        found = flow.finding(k * 10 * MS)
+    assert found == Finding(Cause.FRAMES_LOST, 100.0, pytest.approx(100 * (len(FAST) + MAX_LOST_FRAMES) / (13 * len(FAST))), "buses")
+
+
 @pytest.mark.req("F11")
 def test_unknown_ids_are_counted_and_known_ones_that_nobody_needs_are_not():
     watching = supervisor()
     watching.observe([CanFrame(0x7FF, b"", 0), Sender("AR_Status").frame(0)])
-    assert watching.rejected == {"unknown id": 1}
-    assert watching.received == 2
+    watching.observe([CanFrame(0x7FE, b"", 0)])
+    assert watching.rejected == {"unknown id": 2}
+    assert watching.received == 3
 
 
 @pytest.mark.req("F5")
