@@ -72,6 +72,7 @@ class Actuation:
 
     Attributes:
         demand: what the robots are asked for now.
+        held_back: limits that hold the demand back now.
         engaged_ticks: ticks in which demands were limited.
         held_back_ticks: those of them in which a demand was held back; a controller with more than 1 % of them does not know its limits.
         limited: ticks in which each limit acted, see `UNITS`.
@@ -90,8 +91,8 @@ class Actuation:
         self._drive_step_mps2 = self._resolution.pedal_norm * self._full_drive_mps2
         self._brake_step_mps2 = self._resolution.pedal_norm * self._full_brake_mps2
         self._behind: Counter[str] = Counter()
-        self._held_back: set[str] = set()
         self.demand = NEUTRAL
+        self.held_back: set[str] = set()
         self.engaged_ticks = 0
         self.held_back_ticks = 0
         self.limited: Counter[str] = Counter()
@@ -144,11 +145,11 @@ class Actuation:
 
     def _begin_tick(self) -> None:
         self.engaged_ticks += 1
-        self._held_back.clear()
+        self.held_back.clear()
 
     def _end_tick(self, steering_wheel_rad: float, acceleration_mps2: float) -> None:
         self.demand = Demand(steering_wheel_rad, *self._limit_pedals(acceleration_mps2))
-        self.held_back_ticks += bool(self._held_back)
+        self.held_back_ticks += bool(self.held_back)
 
     def _limit_steering(self, asked_rad: float, speed_mps: float) -> int:
         """Steering-wheel angle in steps of the bus."""
@@ -233,7 +234,7 @@ class Actuation:
         self.limited[name] += 1
         self.last_limited[name] = Activation(self.engaged_ticks, asked, limit, given)
         if name not in _RATES or self._behind[name] * self._tick_ns >= PLAN_PERIOD_NS:
-            self._held_back.add(name)
+            self.held_back.add(name)
 
 
 def _approach(before: int, target: int, low: float, high: float) -> int:

@@ -124,12 +124,15 @@ class Codec:
         self._limits = limits
         self._protectors: dict[str, E2EProtector] = {}
         self._robots: dict[str, dict[str, float]] = {}
+        # From then on a value outside a site's range becomes the nearest one in it: better than no command at all.
+        self._is_rehearsed = False
         try:
             self._read_tables()
             self._rehearse()
-            self._robots.clear()
         except (KeyError, EncodeError) as error:
             raise CatalogueError(f"{', '.join(catalogue.sha256)}: not what the gateway needs: {error}") from error
+        self._robots.clear()
+        self._is_rehearsed = True
         self._protectors = {
             spec.name: E2EProtector(spec.e2e_data_id) for spec in catalogue.by_name.values() if spec.e2e_data_id is not None
         }
@@ -228,7 +231,7 @@ class Codec:
         return [self._frame("GW_Heartbeat", heartbeat, now_ns), self._frame("GW_Status", status, now_ns)]
 
     def _frame(self, name: str, values: dict[str, float], now_ns: int) -> CanFrame:
-        payload = self._catalogue.encode(name, values)
+        payload = self._catalogue.encode(name, values, saturates=self._is_rehearsed)
         if protector := self._protectors.get(name):
             payload = protector.protect(payload)
         return CanFrame(self._catalogue.by_name[name].arbitration_id, payload, now_ns)

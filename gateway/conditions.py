@@ -40,6 +40,8 @@ MAX_ENGAGE_HEADING_RAD = 0.26
 """Distance and heading from the path: Autoware's 1.5 m, and half of its 0.52 rad."""
 MAX_REQUEST_AGE_NS = 1_000_000_000
 """A request that is older was not meant for now."""
+MAX_REQUEST_AHEAD_NS = 10_000_000
+"""A request may be younger than the time of the step that reads it, by what the step has taken until then: at most a period."""
 STANDING_MPS = 0.1
 """Below this speed the car stands."""
 RESET_PATIENCE_NS = 30_000_000_000
@@ -80,6 +82,7 @@ class Situation:
         is_driving: the gateway moves the car.
         is_settled: the robots have had time to follow into Engaged.
         steer_rad: road-wheel angle that is measured [rad].
+        speed_mps: of the car, by navigation or wheels, whoever says more [m/s].
         stopping_ns: time since the present stop began [ns]; 0 when there is none.
     """
 
@@ -96,6 +99,7 @@ class Situation:
     is_driving: bool
     is_settled: bool
     steer_rad: float
+    speed_mps: float
     stopping_ns: int
 
 
@@ -115,6 +119,11 @@ _STATE_CAUSES = (
 )
 
 
+def unsound_messages(observed: Sequence[Finding]) -> frozenset[str]:
+    """Messages that are missing or invalid. A driver who takes over is not told by these: a moving car would be released to nobody."""
+    return frozenset(finding.source for finding in observed if finding.cause in (Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID))
+
+
 def findings(s: Situation, of_state: Sequence[Finding]) -> list[Finding]:
     """What would end an engagement now.
 
@@ -122,7 +131,7 @@ def findings(s: Situation, of_state: Sequence[Finding]) -> list[Finding]:
         of_state: `state_findings` of the same situation.
     """
     found = [*of_state, *(finding for finding in s.observed if finding.cause not in _STATE_CAUSES)]
-    found += _bus_findings(s.surroundings.links)
+    found += _bus_findings(s)
     found += [finding for is_true, finding in _robot_findings(s) if is_true]
     found += [finding for is_true, finding in _command_findings(s) if is_true]
     if s.is_driving:
@@ -130,12 +139,14 @@ def findings(s: Situation, of_state: Sequence[Finding]) -> list[Finding]:
     return found
 
 
-def _bus_findings(links: Mapping[str, LinkHealth]) -> list[Finding]:
+def _bus_findings(s: Situation) -> list[Finding]:
     found = []
-    for network, link in links.items():
+    for network, link in s.surroundings.links.items():
+        # A driver that restarts its controller by itself may have done so since the step before.
+        was_off = link.last_bus_off_ns is not None and s.now_ns - link.last_bus_off_ns <= MAX_UNCONFIRMED_NS
         if link.state is BusState.DOWN:
             found.append(Finding(Cause.BUS_DOWN, 1, 0, network))
-        elif link.state is BusState.BUS_OFF:
+        elif link.state is BusState.BUS_OFF or was_off:
             found.append(Finding(Cause.BUS_OFF, link.bus_offs, 0, network))
         elif link.unconfirmed_ns > MAX_UNCONFIRMED_NS:
             found.append(Finding(Cause.BUS_BLOCKED, link.unconfirmed_ns * _MS_PER_NS, MAX_UNCONFIRMED_NS * _MS_PER_NS, network))
@@ -146,15 +157,17 @@ Judged = Sequence[tuple[bool, Finding]]
 
 
 def _robot_findings(s: Situation) -> Judged:
-    m = s.measurement
+    m, unsound = s.measurement, unsound_messages(s.observed)
+    overridden = [node for node in m.overridden_robots if f"{node}_Status" not in unsound]
+    is_overridden = m.is_driver_override and "RC_SafetyStatus" not in unsound
     question_ms = s.question_age_ns * _MS_PER_NS
     return (
         (m.is_emergency_stopped, Finding(Cause.ROBOTS_EMERGENCY_STOP, 1, 0, m.stop_source)),
         (m.is_stopped_by_robots, Finding(Cause.ROBOTS_STOPPED, 1, 0, m.stop_source)),
         (bool(m.faulty_robots), Finding(Cause.ROBOT_FAULT, len(m.faulty_robots), 0, ", ".join(m.faulty_robots))),
         (s.question_age_ns > WATCHDOG_TIMEOUT_NS, Finding(Cause.WATCHDOG_SILENT, question_ms, WATCHDOG_TIMEOUT_NS * _MS_PER_NS, "RC")),
-        (bool(m.overridden_robots), Finding(_override(m), len(m.overridden_robots), 0, ", ".join(m.overridden_robots))),
-        (m.is_driver_override and not m.overridden_robots, Finding(Cause.DRIVER_OVERRIDE, 1, 0, "RC")),
+        (bool(overridden), Finding(_override(overridden), len(overridden), 0, ", ".join(overridden))),
+        (is_overridden and not overridden, Finding(Cause.DRIVER_OVERRIDE, 1, 0, "RC")),
         (not m.is_in_drive, Finding(Cause.SELECTOR_NOT_IN_DRIVE, 0, 1, "CAR_Powertrain")),
         (abs(m.vx_mps) > s.profile.max_speed_mps, Finding(Cause.OVERSPEED, abs(m.vx_mps), s.profile.max_speed_mps, "navigation")),
     )
@@ -163,9 +176,9 @@ def _robot_findings(s: Situation) -> Judged:
 _OVERRIDES = {"SR": Cause.DRIVER_STEERS, "BR": Cause.DRIVER_BRAKES, "AR": Cause.DRIVER_ACCELERATES}
 
 
-def _override(m: Measurement) -> Cause:
+def _override(nodes: Sequence[str]) -> Cause:
     """What the driver does, by the first of the robots that he overrides; only asked when there is one."""
-    return next((cause for node, cause in _OVERRIDES.items() if node in m.overridden_robots), Cause.DRIVER_OVERRIDE)
+    return next((cause for node, cause in _OVERRIDES.items() if node in nodes), Cause.DRIVER_OVERRIDE)
 
 
 def _command_findings(s: Situation) -> Judged:
@@ -232,7 +245,7 @@ def untimely(request: OperatorRequest, now_ns: int, last_ns: int) -> str:
     if request.operation is Operation.STOP:
         return ""
     age_ns = now_ns - request.t_ns
-    if age_ns < 0:
+    if age_ns < -MAX_REQUEST_AHEAD_NS:
         return "the request is from the future"
     if request.t_ns <= last_ns:
         return "the request is repeated, or made before another one"
@@ -250,8 +263,8 @@ def refusals(operation: Operation, s: Situation, blocked_by: Sequence[str]) -> l
             return [*blocked_by, *_engage_refusals(s)]
         case Operation.DISENGAGE if s.stopping_ns:
             return ["a stop is ended by a reset"]
-        case Operation.RESET if 0 < s.stopping_ns < RESET_PATIENCE_NS and abs(s.measurement.vx_mps) > STANDING_MPS:
-            return [f"the car moves: {s.measurement.vx_mps:.1f} m/s"]
+        case Operation.RESET if 0 < s.stopping_ns < RESET_PATIENCE_NS and s.speed_mps > STANDING_MPS:
+            return [f"the car moves: {s.speed_mps:.1f} m/s"]
     return []
 
 

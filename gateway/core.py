@@ -5,6 +5,7 @@ Decode, judge, decide the mode, choose a demand, limit it, encode. Nothing here 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 from dbc.catalogue import Catalogue
 from dbc.frame import CanFrame
@@ -12,12 +13,24 @@ from dbc.vehicle import Vehicle
 from gateway.actuation import Actuation
 from gateway.causes import Cause, Disengagement, Finding
 from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, RobotLimits
-from gateway.commands import MAX_STATE_LAG, CommandGate
-from gateway.conditions import UNDISTURBED, Situation, Surroundings, blockers, findings, refusals, settling, state_findings, untimely
+from gateway.commands import MAX_STATE_LAG, NEVER_NS, CommandGate
+from gateway.conditions import (
+    COMMAND_TIMEOUT_NS,
+    UNDISTURBED,
+    Situation,
+    Surroundings,
+    blockers,
+    findings,
+    refusals,
+    settling,
+    state_findings,
+    unsound_messages,
+    untimely,
+)
 from gateway.latency import LatencyChain
 from gateway.limits import PROVING_GROUND, Demand, LimitProfile
 from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest, VehicleState
-from gateway.modes import DRIVING, REACTIONS, TRANSITIONS, ModeMachine, Transition, Trigger
+from gateway.modes import DRIVING, QUIET, REACTIONS, TRANSITIONS, ModeMachine, Transition, Trigger
 from gateway.plausibility import Plausibility
 from gateway.safe_stop import SafeStop, plan_index
 from gateway.supervision import Supervisor
@@ -30,6 +43,8 @@ ROBOT_SPEED_MARGIN = 1.1
 ENGAGE_GRACE_NS = 200_000_000
 """Time that the robots have to follow into Engaged [ns]."""
 
+_REMEMBERED_STATES = MAX_STATE_LAG + 1
+"""States that a command may answer."""
 _TIME_MESSAGE = "MilliTime"
 """Tells the time of validity of the navigation data."""
 _TRIGGER_OF_OPERATION = {Operation.ARM: Trigger.ARM, Operation.ENGAGE: Trigger.ENGAGE, Operation.RESET: Trigger.RESET}
@@ -67,6 +82,7 @@ class GatewayCore:
     def __init__(self, catalogue: Catalogue, vehicle: Vehicle, boot_id: int, profile: LimitProfile = PROVING_GROUND) -> None:
         self.profile = profile
         self._ratio = vehicle.steering.ratio
+        self._wheel_radius_m = vehicle.model.wheel_radius_m
         self._boot_id = boot_id
         self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps, ROBOT_SPEED_MARGIN * profile.max_speed_mps))
         self._navigation_timeout_ns = catalogue.by_name[_TIME_MESSAGE].timeout_ns
@@ -84,9 +100,9 @@ class GatewayCore:
         self._asked_ns = 0
         self._engaged_since_ns = 0
         self._stop_since_ns: int | None = None
-        self._state_times_ns = [0] * (MAX_STATE_LAG + 1)
+        self._state_times_ns = [0] * _REMEMBERED_STATES
         self._measurement_id = 0
-        self._last_request_ns = 0
+        self._last_request_ns: int | None = None
         self.ticks = 0
         self.supervisor = Supervisor(catalogue, NEEDED_MESSAGES)
         self.commands = CommandGate()
@@ -116,7 +132,7 @@ class GatewayCore:
         surroundings: Surroundings = UNDISTURBED,
     ) -> StepOutput:
         """Advance to `now_ns` with what has arrived since the last step."""
-        if self._last_step_ns is None:
+        if self._last_request_ns is None:
             self._last_request_ns = now_ns - TICK_NS  # what was asked before this gateway lived does not act
         self._observe(now_ns, frames)
         self._admit(now_ns, command)
@@ -125,7 +141,7 @@ class GatewayCore:
         self._is_state_good = not of_state
         self.findings = findings(situation, of_state)
         self.blockers = self._blockers(situation)
-        refused = [] if request is None else self._refusals(request, situation)
+        refused = [] if request is None else self._refusals(request, situation, self._last_request_ns)
         granted = None if refused or request is None else request.operation
         transition = self._modes.update(now_ns, self._with_request(granted), self._triggers(granted))
         if transition is not None:
@@ -141,11 +157,12 @@ class GatewayCore:
         """Take frames in between two steps.
 
         Returns:
-            A state for the controller at once when the navigation data are new; what is wrong with them is judged by `step`.
+            A state for the controller at once when the navigation data are new, one between two steps; what is wrong with them is
+            judged by `step`.
         """
         before_ns = self._state_time_ns
         self._observe(now_ns, frames)
-        if self._state_time_ns == before_ns:
+        if self._state_time_ns == before_ns or self._sensed is not None:
             return None
         self._sensed = self._state()
         return self._sensed
@@ -163,14 +180,18 @@ class GatewayCore:
             self.latency.echoed(m.measurement_id, now_ns)
 
     def _admit(self, now_ns: int, command: ControlCommand | None) -> None:
+        if self.mode in QUIET and COMMAND_TIMEOUT_NS < self.commands.age_ns(now_ns) < NEVER_NS:
+            self.commands.reset()  # a controller that has gone may come back as another process
         if command is not None and self.commands.offer(now_ns, command, self._state_seq):
-            self._measurement_id = self.latency.answered(self._state_times_ns[command.state_seq % len(self._state_times_ns)])
+            self._measurement_id = self.latency.answered(self._state_times_ns[command.state_seq % _REMEMBERED_STATES])
 
     def _situation(self, now_ns: int, surroundings: Surroundings) -> Situation:
         m, is_driving = self.measurement, self.mode in DRIVING
-        is_settled = self.mode is not Mode.ENGAGED or now_ns - self._engaged_since_ns > ENGAGE_GRACE_NS
+        is_settled = now_ns - self._engaged_since_ns > ENGAGE_GRACE_NS
         observed = self.supervisor.findings(now_ns)
-        observed += self._plausibility.update(now_ns, m, self.actuation.demand, is_driving and is_settled)
+        unsound = unsound_messages(observed)
+        contradictions = self._plausibility.update(now_ns, m, self.actuation.demand, is_driving and is_settled)
+        observed += [finding for finding in contradictions if finding.source not in unsound]
         if is_driving:
             observed += self.latency.findings(now_ns)
         return Situation(
@@ -183,12 +204,19 @@ class GatewayCore:
             state_age_ns=now_ns - self._state_time_ns,
             navigation_timeout_ns=self._navigation_timeout_ns,
             question_age_ns=now_ns - self._asked_ns,
-            tick_gap_ns=0 if self._last_step_ns is None else now_ns - self._last_step_ns,
+            tick_gap_ns=now_ns - (self._last_step_ns or now_ns),
             is_driving=is_driving,
             is_settled=is_settled,
             steer_rad=m.steering_wheel_rad / self._ratio,
+            speed_mps=self._speed_mps,
             stopping_ns=0 if self._stop_since_ns is None else now_ns - self._stop_since_ns,
         )
+
+    @property
+    def _speed_mps(self) -> float:
+        """By whoever says more: a car stands when navigation and wheels agree that it does."""
+        wheels_mps = median(self.measurement.wheel_speed_radps) * self._wheel_radius_m
+        return max(abs(self.measurement.vx_mps), abs(wheels_mps))
 
     def _blockers(self, situation: Situation) -> list[str]:
         blocked = blockers(situation, self.findings)
@@ -199,11 +227,11 @@ class GatewayCore:
             self._good_since_ns = situation.now_ns
         return settling(situation.now_ns - self._good_since_ns)
 
-    def _refusals(self, request: OperatorRequest, situation: Situation) -> list[str]:
+    def _refusals(self, request: OperatorRequest, situation: Situation, last_ns: int) -> list[str]:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
-        if refused := untimely(request, situation.now_ns, self._last_request_ns):
+        if refused := untimely(request, situation.now_ns, last_ns):
             return [refused]
-        self._last_request_ns = max(min(request.t_ns, situation.now_ns), self._last_request_ns)  # a STOP may be of any time
+        self._last_request_ns = max(min(request.t_ns, situation.now_ns), last_ns)  # a STOP may be of any time
         trigger = _TRIGGER_OF_OPERATION.get(request.operation) or REACTIONS[_CAUSE_OF_OPERATION[request.operation]]
         if (self.mode, trigger) not in TRANSITIONS:
             return [f"not possible in {self.mode.name}"]
@@ -229,7 +257,7 @@ class GatewayCore:
             self.actuation.start_from(Demand(m.steering_wheel_rad, m.accelerator_norm, m.brake_norm))
         elif transition.after in (Mode.COMFORT_STOP, Mode.SAFE_STOP):
             grade = self.profile.safe_stop if transition.after is Mode.SAFE_STOP else self.profile.comfort_stop
-            self._safe_stop = SafeStop(now_ns, self.commands.newest, self.actuation.steer_rad, -m.ax_mps2, grade)
+            self._safe_stop = SafeStop(now_ns, self.commands.newest, self.actuation.steer_rad, -self.actuation.acceleration_mps2, grade)
         elif transition.after is Mode.STANDBY and transition.before is not Mode.READY:
             self.commands.reset()
         self._stop_since_ns = now_ns if transition.after in _STOPPED else None
@@ -241,7 +269,7 @@ class GatewayCore:
             k = plan_index(command, now_ns)
             self.actuation.follow(command.plan_steer_rad[k], command.plan_drive_norm[k], m.vx_mps, m.brake_norm)
         elif self.mode in (Mode.COMFORT_STOP, Mode.SAFE_STOP) and self._safe_stop is not None:
-            stop = self._safe_stop.demand(now_ns, m.vx_mps)
+            stop = self._safe_stop.demand(now_ns, self._speed_mps)
             if stop.is_standing:
                 self.actuation.hold_still()
             else:
@@ -252,7 +280,7 @@ class GatewayCore:
     def _state(self) -> VehicleState:
         m = self.measurement
         self._state_seq += 1
-        self._state_times_ns[self._state_seq % len(self._state_times_ns)] = self._state_time_ns
+        self._state_times_ns[self._state_seq % _REMEMBERED_STATES] = self._state_time_ns
         return VehicleState(
             boot_id=self._boot_id,
             seq=self._state_seq,

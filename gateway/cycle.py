@@ -10,9 +10,10 @@ from gateway.channel import Channel, OperatorServer
 from gateway.conditions import Surroundings
 from gateway.core import StepOutput
 from gateway.ending import Ending
-from gateway.housekeeping import QUIET, Notice, Orders, Pulse
+from gateway.housekeeping import Notice, Orders, Pulse
 from gateway.journal import Glance, StepArguments
 from gateway.messages import ControlCommand, Operation, OperatorReply, OperatorRequest
+from gateway.modes import DRIVING, QUIET
 from gateway.pacing import Pacer
 from gateway.preparation import Preparation
 from gateway.recorder import Recorder, RecorderStatus
@@ -115,17 +116,18 @@ class ControlCycle:
         return Surroundings(health, self._record.is_recording, self._record.disk_free_share)
 
     def _answer(self, reply: OperatorReply) -> None:
-        if reply.operation is Operation.RESET:  # a bus-off that is still there must not keep it from being left
+        # A bus-off that is still there must not keep a reset from being granted. While the car is driven there is none to leave, and a
+        # request that is refused anyway must not make the link forget which of its frames have not got through.
+        if reply.operation is Operation.RESET and reply.mode not in DRIVING:
             self._links.buses.recover()
         if reply.boot_id != self._boot_id:
             self._links.operators.reply(reply)
 
     def _request(self, now_ns: int) -> OperatorRequest | None:
-        """What an operator wants, or what has to be done before the process may end."""
-        request = self._links.operators.next_request()
-        if request is None and self._ending is not None and (operation := self._ending.request(self._core.mode)) is not None:
+        """What has to be done before the process may end, else what an operator wants."""
+        if self._ending is not None and (operation := self._ending.request(self._core.mode)) is not None:
             return OperatorRequest(self._boot_id, self._core.ticks, operation, now_ns)
-        return request
+        return self._links.operators.next_request()
 
     def _tell(self, now_ns: int, output: StepOutput, overruns: int, cpu_ns: int) -> None:
         if output.transition is not None:

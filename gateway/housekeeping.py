@@ -17,15 +17,13 @@ from dbc.health import BusState
 from dbc.realtime import Grant
 from gateway.loop import Histogram
 from gateway.messages import Mode
-from gateway.modes import Transition
+from gateway.modes import QUIET, Transition
 from gateway.preparation import Preparation
 from gateway.systemd import Notifier
 from gateway.telemetry import StatusSample
 
 log = logging.getLogger("xilgate.gateway")
 
-QUIET = (Mode.SILENT, Mode.STANDBY)
-"""Modes in which nobody is driven and nobody expects to be: another configuration may come in force."""
 _PERIOD_S = 0.05
 _MAX_EVENTS = 256
 

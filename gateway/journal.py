@@ -59,6 +59,11 @@ class StepArguments(NamedTuple):
     surroundings: Surroundings = UNDISTURBED
     glances: Sequence[Glance] = ()
 
+    @property
+    def received(self) -> list[CanFrame]:
+        """All frames since the step before, in the order of their arrival."""
+        return [frame for frames in (*(glance.frames for glance in self.glances), self.frames) for frame in frames]
+
     def step(self, core: "GatewayCore") -> "StepOutput":
         """Let a core do it."""
         for glance in self.glances:

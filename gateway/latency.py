@@ -51,9 +51,9 @@ class LatencyChain:
         """The robots act on the command with this id; those before it they have passed over. Only the first echo counts."""
         if measurement_id not in self._awaited:
             return
-        # In the order of their commands: what is before this one will not come any more.
-        while measurement_id in self._awaited:
-            state_t_ns = self._awaited.pop(next(iter(self._awaited)))
+        awaited = list(self._awaited)
+        for passed in awaited[: awaited.index(measurement_id) + 1]:  # in the order of their commands: what is before will not come any more
+            state_t_ns = self._awaited.pop(passed)
         self._measure(arrival_ns - state_t_ns)
 
     def _measure(self, age_ns: int) -> None:

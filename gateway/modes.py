@@ -97,6 +97,8 @@ TRANSITIONS: Mapping[tuple[Mode, Trigger], Mode] = {
 
 DRIVING = (Mode.ENGAGED, Mode.COMFORT_STOP, Mode.SAFE_STOP)
 """In these the gateway moves the car."""
+QUIET = (Mode.SILENT, Mode.STANDBY)
+"""In these nobody is driven and nobody expects to be: another configuration may come in force, another controller may come."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,7 @@ class _Motion:
     def update(self, m: Measurement) -> None:
         """Take in a measurement; nothing is new without a new time of validity."""
         now = (m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad)
-        before = self._before or now
+        before = now if self._before is None else self._before
         elapsed_ms = m.navigation_time_ms - before[0]
         if elapsed_ms in range(1, MOTION_WINDOW_MS + 1):
             self._steps.append(_unexplained(before, m, elapsed_ms * 1e-3))
@@ -175,7 +175,7 @@ class Plausibility:
         ]
 
     def _judge_steering_rate(self, now_ns: int, m: Measurement) -> list[Finding]:
-        before_ns, before_rad = self._steered or (now_ns, m.steering_wheel_rad)
+        before_ns, before_rad = (now_ns, m.steering_wheel_rad) if self._steered is None else self._steered
         if m.steering_wheel_rad == before_rad:
             self._steered = (before_ns, before_rad)
             return []

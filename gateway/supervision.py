@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 
 from dbc.catalogue import Catalogue, DecodeError, MessageSpec
-from dbc.e2e import E2EReceiver
+from dbc.e2e import E2EReceiver, E2EState, E2EWindow, WindowRules
 from dbc.frame import CanFrame
 from gateway.causes import Cause, Finding
 
@@ -25,7 +25,7 @@ MAX_LOST_FRAMES = 5
 """Frames lost in that time that are only counted, of about 160: with 1 % lost there are 2, with 20 % there are 31."""
 MAX_FLOW_CYCLE_NS = 10_000_000
 
-_WINDOW_MASK = (1 << WINDOW_FRAMES) - 1
+_RULES = WindowRules(WINDOW_FRAMES, MAX_BAD_FRAMES, clean_ns=RECOVERY_NS)
 _MS_PER_NS = 1e-6
 
 
@@ -41,8 +41,7 @@ class MessageWatch:
         self.spec = spec
         self.last_good_ns: int | None = None
         self._receiver = None if spec.e2e_data_id is None else E2EReceiver(spec.e2e_data_id)
-        self._window = 0
-        self._invalid_until_ns: int | None = None
+        self._window = E2EWindow(spec.timeout_ns, _RULES)
 
     def reject_cause(self, frame: CanFrame) -> str | None:
         """Why a frame must not be decoded; None when it may."""
@@ -54,17 +53,9 @@ class MessageWatch:
 
     def note(self, t_ns: int, is_good: bool) -> None:
         """Remember what became of a frame."""
-        self._window = (self._window << 1 | (not is_good)) & _WINDOW_MASK
+        self._window.add(t_ns, is_good)
         if is_good:
             self.last_good_ns = t_ns
-            return
-        if self._invalid_until_ns is not None or self.bad_frames > MAX_BAD_FRAMES:
-            self._invalid_until_ns = t_ns + RECOVERY_NS
-
-    @property
-    def bad_frames(self) -> int:
-        """Bad ones among the last `WINDOW_FRAMES`."""
-        return self._window.bit_count()
 
     def finding(self, now_ns: int) -> Finding | None:
         """What is wrong with the message now."""
@@ -72,9 +63,8 @@ class MessageWatch:
         age_ns = spec.timeout_ns + 1 if self.last_good_ns is None else now_ns - self.last_good_ns
         if age_ns > spec.timeout_ns:
             return Finding(Cause.MESSAGE_MISSING, age_ns * _MS_PER_NS, spec.timeout_ns * _MS_PER_NS, spec.name)
-        if self._invalid_until_ns is not None and now_ns <= self._invalid_until_ns:
-            return Finding(Cause.MESSAGE_INVALID, self.bad_frames, MAX_BAD_FRAMES, spec.name)
-        self._invalid_until_ns = None
+        if self._window.state is E2EState.INVALID:
+            return Finding(Cause.MESSAGE_INVALID, self._window.bad_frames, MAX_BAD_FRAMES, spec.name)
         return None
 
 

@@ -283,7 +283,7 @@ class RecordFiles:
         messages = []
         for record in records:
             step = unpack_step(record, "step")
-            for frames, is_rx in ((step.arguments.frames, True), (step.sent, False)):
+            for frames, is_rx in ((step.arguments.received, True), (step.sent, False)):
                 for frame in frames:
                     network = self._networks.get(frame.arbitration_id, UNKNOWN_NETWORK)
                     messages.append(

@@ -108,9 +108,9 @@ def test_ranges(tmp_path, signal, expected):
 
 def test_a_signal_longer_than_a_frame(tmp_path):
     found = findings(tmp_path, message("S : 0|65@1+ (1,0) [0|9]", length=9))
-    expected = [error("longer than a classical frame", "9 bytes", "8 bytes"), error("longer than a classical frame", "65 bits", "64 bits", "S")]
-    assert found == expected
-    assert error("longer than a classical frame", "99999 bits", "64 bits", "S") in findings(tmp_path, message("S : 0|99999@1+ (0.5,0) [0|9]"))
+    text = "longer than a classical frame"
+    assert found == [error(text, "9 bytes", "8 bytes"), error(text, "65 bits", "64 bits", "S")]
+    assert error(text, "99999 bits", "64 bits", "S") in findings(tmp_path, message("S : 0|99999@1+ (0.5,0) [0|9]"))
 
 
 def test_value_tables(tmp_path):

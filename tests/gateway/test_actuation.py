@@ -435,8 +435,10 @@ def test_a_tick_is_held_back_once():
     rates = {"steering rate": 0, "lateral jerk": 1, "drive jerk": 1}
     assert +gate.limited == +Counter(rates | {"steering angle": 1, "lateral acceleration": 1, "acceleration": 1})
     assert (gate.engaged_ticks, gate.held_back_ticks) == (1, 1)
+    assert gate.held_back == {"steering angle", "lateral acceleration", "acceleration"}
     gate.follow(0.0, 0.0, 30.0, 0.0)
     assert (gate.engaged_ticks, gate.held_back_ticks) == (2, 1)
+    assert gate.held_back == set()
 
 
 def test_every_limit_has_a_unit():

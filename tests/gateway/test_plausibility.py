@@ -163,6 +163,18 @@ def test_its_first_time_may_be_zero():
     assert drive.until_found() == 100 * MS
 
 
+@pytest.mark.parametrize("speed_mps", [3.0, 36.0])
+def test_a_time_may_come_before_its_position(speed_mps):
+    """The frames of a solution may fall into two steps of the gateway."""
+    plausibility = Plausibility(CAR)
+    for k in range(200):
+        m = Measurement(
+            x_m=speed_mps * 0.02 * ((k - 1) // 2), vx_mps=speed_mps, navigation_time_ms=BEGIN_MS + 20 * (k // 2),
+            wheel_speed_radps=(speed_mps / RADIUS_M,) * 4,
+        )  # fmt: skip
+        assert not plausibility.update(k * TICK_NS, m, Demand(0.0, 0.0, 0.0), False)
+
+
 # ---- speed
 
 

@@ -59,7 +59,7 @@ class Source:
         for _ in range(count):
             self.drive.now_ns += 10_000_000
             arguments = step(self.drive, self.drive.now_ns)
-            self.frames += len(arguments.frames) + len(self.drive.output.frames)
+            self.frames += len(arguments.received) + len(self.drive.output.frames)
             made.append(pack_step(self.seq, arguments, self.drive.output))
             self.seq += 1
         return made
@@ -87,7 +87,7 @@ def test_every_format_holds_every_frame_with_its_time_and_bus(tmp_path, source):
     assert ([one.seq for one in steps], is_cut) == (list(range(300)), False)
     expected = [
         (frame.arbitration_id, frame.data, is_rx)
-        for one in steps for frames, is_rx in ((one.arguments.frames, True), (one.sent, False)) for frame in frames
+        for one in steps for frames, is_rx in ((one.arguments.received, True), (one.sent, False)) for frame in frames
     ]  # fmt: skip
     assert len(expected) == source.frames > 1000
     for suffix in READERS:
@@ -334,7 +334,7 @@ def test_a_gateway_is_recorded_to_its_last_tick(tmp_path, recorder):
     assert [one.seq for one in steps] == list(range(count))
     assert not is_cut
     assert head == pack_value(session_like(head))
-    assert len(bus_record(tmp_path, "blf")) == sum(len(one.arguments.frames) + len(one.sent) for one in steps)
+    assert len(bus_record(tmp_path, "blf")) == sum(len(one.arguments.received) + len(one.sent) for one in steps)
 
 
 def session_like(head):
@@ -461,6 +461,6 @@ def check_kill(running, name):
     assert len(kept) >= len(old) > 0
     if name == "gateway":  # the recorder lives on until it has everything
         assert len(kept) >= len(times_ns)
-    frames = sum(len(one.arguments.frames) + len(one.sent) for one in steps)
+    frames = sum(len(one.arguments.received) + len(one.sent) for one in steps)
     for suffix in READERS:
         assert len(bus_record(running.directory, suffix)) == frames, suffix

@@ -136,7 +136,6 @@ def test_bad_frames_that_lie_far_apart_are_only_counted():
 @pytest.mark.parametrize(("last", "is_invalid"), [(WINDOW_FRAMES - 1, True), (WINDOW_FRAMES, False)])
 def test_three_bad_frames_count_together_when_ten_frames_hold_them(last, is_invalid):
     watching, sender, position = supervisor(), Sender(), Sender("PosLocal")
-    sender.frame(0)
     watching.observe([sender.frame(0)])
     for k in range(WINDOW_FRAMES + 1):
         t_ns = k * 10 * MS

@@ -5,6 +5,7 @@ of its own, and the steps follow the commands as in the gateway's process. A wor
 """
 
 import copy
+import copyreg
 import random
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -20,6 +21,8 @@ from gateway.pacing import Pacer
 from tests.support.bus_oracle import BusOracle
 from tests.support.oracle_limits import REACTIONS
 from tests.support.robots import StubCar
+
+copyreg.pickle(type({}.keys()), lambda keys: (frozenset, (list(keys),)))
 
 MS = 1_000_000
 TICK_NS = 10 * MS
@@ -160,6 +163,10 @@ class World:
     def mark_end(self, fault: str) -> None:
         """A fault to which no reaction is due is over."""
         self.oracle.mark_end(fault)
+
+    def next_frame_ns(self, name: str) -> int:
+        """When the car sends the first frame of a message that knows what is done to the car now."""
+        return self._car_ns + self.phases[catalogue().by_name[name].arbitration_id]
 
     def lose_commands(self, from_ns: int) -> None:
         """Commands that would arrive from then on do not; what was wrong with them has not happened."""

@@ -220,7 +220,7 @@ def bad_commands(kind: str, count: int = 1 << 30) -> Callable[[World], None]:
 
         def spoil(command: ControlCommand) -> ControlCommand:
             seen[0] += 1
-            if seen[0] == 3 and count >= 3:
+            if seen[0] == 1 and count >= 3:
                 world.mark(command.t_ns + world.controller.delay_ns, "F5")
             return BAD_COMMANDS[kind](command, world.rng) if seen[0] <= count else command
 
@@ -244,7 +244,7 @@ def second_controller(world: World) -> None:
             strangers[0] += 1
             plan = (0.3,) * HORIZON_STEPS
             arrival_ns = begun_ns + world.controller.delay_ns
-            if strangers[0] == 3:
+            if strangers[0] == 1:
                 world.mark(arrival_ns, "F5")
             commands.append((arrival_ns, ControlCommand(
                 4711, strangers[0], state.seq, begun_ns, CommandStatus.OK, 0, 0.0, 0.0, 0.3, 1.0, plan, (1.0,) * HORIZON_STEPS
@@ -480,7 +480,7 @@ def driver(act: Callable[[World], str]) -> Callable[[World], None]:
 
     def inject(world: World) -> None:
         name = act(world)
-        world.mark(world.now_ns + world.phases[catalogue().by_name[name].arbitration_id], "E3")
+        world.mark(world.next_frame_ns(name), "E3")
 
     return inject
 

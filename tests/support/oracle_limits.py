@@ -127,7 +127,7 @@ REACTIONS = {
     "F2": Reaction(Kind.STOP, 120 * MS, "B3 F2: same as F1", 150 * MS),
     "F3": Reaction(Kind.NONE, 0, "B3 F3: exactly one missed solve: no disengagement"),
     "F4": Reaction(Kind.STOP, 10 * MS, "B3 F4: within one tick after the third degraded cycle, or a failed one"),
-    "F5": Reaction(Kind.STOP, 10 * MS, "B3 F5: in the tick of the third bad command in a row"),
+    "F5": Reaction(Kind.STOP, 100 * MS, "B3 F5: in the tick of the third bad command in a row; from the first one, every 40 ms"),
     "F5 one": Reaction(Kind.NONE, 0, "B3 F5: a single bad command is dropped, never encoded"),
     "F6": Reaction(Kind.STOP, 70 * MS, "B3 F6: 3 periods and at least 30 ms, at most 50 ms; first safe frame 70 ms"),
     "F7": Reaction(Kind.STOP, 100 * MS, "B3 F7: 3 bad of 10 frames at 100 Hz"),

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.vehicle import FOCUS
-from gateway.journal import StepArguments
+from gateway.journal import Glance, StepArguments
 from gateway.limits import PROVING_GROUND
 from gateway.record.session import gateway_session
 from gateway.recorder import BusFormat, FileOptions, Recorder
@@ -22,7 +22,9 @@ def session():
 
 def step(drive: GatewayDrive, now_ns: int) -> StepArguments:
     """One tick of the stub car and the gateway at this time; what the gateway was given."""
-    arguments = StepArguments(now_ns, drive.car.speak(now_ns))
+    frames = drive.car.speak(now_ns)
+    early, late = frames[: len(frames) // 2], frames[len(frames) // 2 :]
+    arguments = StepArguments(now_ns, late, glances=[Glance(now_ns - 1_000_000, early)])
     drive.output = arguments.step(drive.core)
     drive.car.hear(drive.output.frames)
     return arguments
