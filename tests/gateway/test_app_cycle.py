@@ -226,3 +226,27 @@ def test_status_tells_of_limits_latency_traffic_and_how_an_engagement_ended(benc
     assert status.limited_share > 0.0
     ended = status.disengagement
     assert (ended.cause, ended.code, ended.source, ended.unit) == ("DRIVER_OVERRIDE", 63, "RC", "")
+
+
+@pytest.mark.req("F10")
+def test_a_reset_lets_the_buses_recover_but_not_while_the_car_is_driven(bench):
+    bench.engage()
+    bench.ask(Operation.RESET)
+    bench.tick()
+    assert bench.replies[-1].refusals == ("not possible in ENGAGED",)
+    assert bench.buses.recoveries == 0  # it would forget which frames have not got through
+    bench.car.emergency_stop = 1
+    bench.tick(2)
+    assert bench.mode is Mode.FAULT
+    bench.ask(Operation.RESET)
+    bench.tick()
+    assert bench.buses.recoveries == 1
+
+
+def test_whoever_keeps_asking_does_not_keep_the_process_from_ending(bench):
+    bench.engage()
+    bench.orders.ends = 1
+    for _ in range(4):
+        bench.ask(Operation.ARM)
+        bench.tick()
+    assert bench.mode is Mode.COMFORT_STOP

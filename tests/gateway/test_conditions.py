@@ -281,3 +281,26 @@ def test_a_request_acts_once_and_soon_or_not_at_all():
         assert asked(NOW_NS - 1_001 * MS, operation=operation) == "the request is 1.0 s old, limit 1 s"
     for t_ns in (NOW_NS - 1_001 * MS, NOW_NS + 1, NOW_NS - 5):
         assert asked(t_ns, NOW_NS - 5, operation=Operation.STOP) == ""
+
+
+@pytest.mark.req("F10")
+def test_a_bus_off_between_two_steps_is_not_missed():
+    def causes(age_ns):
+        return [finding.cause for finding in found(situation(**with_link(bus_offs=1, last_bus_off_ns=NOW_NS - age_ns)))]
+
+    assert causes(0) == causes(50 * MS) == [Cause.BUS_OFF]
+    assert causes(51 * MS) == []
+
+
+@pytest.mark.req("E3", "F7")
+@pytest.mark.parametrize("cause", [Cause.MESSAGE_MISSING, Cause.MESSAGE_INVALID])
+def test_a_driver_who_takes_over_is_told_by_sound_messages_only(cause):
+    def handed_over(source, **changes):
+        s = situation(measurement=measured(**changes), observed=[Finding(cause, 1, 0, source)])
+        return [finding.source for finding in found(s) if finding.cause is not cause]
+
+    assert handed_over("PosLocal", overridden_robots=("SR", "BR")) == ["SR, BR"]
+    assert handed_over("SR_Status", overridden_robots=("SR", "BR")) == ["BR"]
+    assert handed_over("SR_Status", overridden_robots=("SR",)) == []
+    assert handed_over("SR_Status", overridden_robots=("SR",), is_driver_override=True) == ["RC"]
+    assert handed_over("RC_SafetyStatus", is_driver_override=True) == []

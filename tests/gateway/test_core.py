@@ -1,6 +1,7 @@
 """The gateway in closed loop with a stub car, in virtual time: engagement, hand-over, stops, limits."""
 
 import math
+from dataclasses import replace
 
 import pytest
 from hypothesis import Phase, given, settings
@@ -227,6 +228,119 @@ def test_reset_leaves_a_safe_stop_and_allows_a_new_engagement():
     drive.engage()
 
 
+def test_a_stop_is_not_reset_because_of_a_speed_that_the_wheels_contradict():
+    drive = GatewayDrive().engage().tick(50)
+    drive.car.vx_mps, drive.car.wheel_speed_offset_mps = 0.0, 20.0
+    drive.tick(20)
+    assert drive.transitions[-1].finding.cause is Cause.SPEED_IMPLAUSIBLE
+    drive.ask(Operation.RESET)
+    drive.tick()
+    assert drive.output.reply.refusals == ("the car moves: 20.0 m/s",)
+    drive.tick(200)
+    assert drive.core.mode is Mode.SAFE_STOP
+    assert drive.car.told["BR_Command"]["PositionCommand"] == pytest.approx(25.0, abs=0.1)  # it brakes on, and is not held as if it stood
+    drive.car.wheel_speed_offset_mps = 0.0
+    drive.ask(Operation.RESET)
+    drive.tick()
+    assert drive.core.mode is Mode.STANDBY
+
+
+@pytest.mark.req("E3", "F6")
+@pytest.mark.parametrize("drive_norm", [0.3, -1.0])
+def test_pedals_that_are_not_told_any_more_are_no_foot(drive_norm):
+    drive = GatewayDrive()
+    drive.car.is_following, drive.car.vx_mps = True, 25.0
+    drive.engage().tick(40)
+    drive.drive_norm = drive_norm
+    drive.tick(40)
+    drive.drive_norm = 0.0  # the robot lets the pedal go, and nobody sees it
+    drive.car.silent = {"CAR_Powertrain"}
+    drive.tick(100)
+    assert [t.finding.cause for t in drive.transitions[2:]] == [Cause.MESSAGE_MISSING]
+    assert drive.core.mode is Mode.SAFE_STOP
+
+
+@pytest.mark.req("E3", "F7")
+@pytest.mark.parametrize(("lie", "message"), [({"override_of": {"BR"}}, "BR_Status"), ({"override": 1}, "RC_SafetyStatus")])
+def test_a_message_that_is_invalid_does_not_hand_the_car_over(lie, message):
+    drive = GatewayDrive().engage().tick(50)
+    drive.car.corrupt = {message}
+    drive.tick(4)
+    assert drive.transitions[-1].finding.cause is Cause.MESSAGE_INVALID
+    drive.car.corrupt = set()
+    for name, value in lie.items():
+        setattr(drive.car, name, value)
+    drive.tick(90)
+    assert drive.core.mode is Mode.SAFE_STOP
+    drive.tick(30)  # clean for a second: now it is believed
+    assert drive.core.mode is Mode.STANDBY
+
+
+def test_a_stop_begins_with_what_is_asked_for_not_with_a_sample_of_the_accelerometer():
+    drive = GatewayDrive().engage().tick(50)
+    drive.car.acceleration_mps2 = -9.0
+    drive.ask(Operation.STOP)
+    drive.tick()
+    drive.car.acceleration_mps2 = 0.0
+    drive.tick(50)
+    assert drive.core.mode is Mode.COMFORT_STOP
+    assert drive.core.actuation.acceleration_mps2 == pytest.approx(-0.15, abs=0.005)  # 0.3 m/s3 for half a second
+
+
+def test_a_stop_soon_after_the_engagement_stays_gentle():
+    drive = GatewayDrive()
+    drive.car.system_state = "Armed"  # it takes the robots some time to follow
+    drive.engage()
+    drive.ask(Operation.STOP)
+    drive.tick(5)
+    drive.car.system_state = None
+    drive.tick(50)
+    assert drive.core.mode is Mode.COMFORT_STOP
+
+
+@pytest.mark.req("S2")
+@pytest.mark.parametrize("arms", [False, True])
+def test_a_controller_may_come_back_as_another_process_while_nothing_is_armed(arms):
+    drive = GatewayDrive()
+    drive = drive.arm() if arms else drive.tick(50)
+    drive.is_controller_alive = False
+    drive.tick(30)
+    assert drive.core.mode is (Mode.STANDBY if arms else Mode.SILENT)
+    drive.is_controller_alive, drive.command_boot_id = True, 8
+    drive.engage()
+
+
+@pytest.mark.req("S2")
+def test_a_second_controller_does_not_take_the_place_of_one_that_lives():
+    drive = GatewayDrive().tick(50)
+    for _ in range(50):
+        drive.tick(4)
+        drive.core.commands.offer(drive.now_ns, replace(drive.command(), boot_id=8, seq=10**6), drive.core._state_seq)
+    assert drive.core.commands.newest.boot_id == 7
+    assert any("second controller" in name for name in drive.core.blockers)
+
+
+@pytest.mark.req("E2")
+def test_a_request_that_is_made_while_a_step_is_under_way_is_heard():
+    drive = GatewayDrive().engage()
+    drive.ask(Operation.DISENGAGE)
+    drive._to_send = replace(drive._to_send, t_ns=drive.now_ns + TICK_NS + 300_000)  # after the time that the step goes by
+    drive.tick()
+    assert drive.output.reply.refusals == ()
+    assert drive.core.mode is Mode.STANDBY
+
+
+def test_between_two_steps_there_is_one_state_however_fast_the_navigation_system():
+    drive = GatewayDrive().tick(3)
+    seq, states = drive.output.state.seq, []
+    for k in range(1, 4):
+        frames = drive.car.speak(drive.now_ns)
+        states.append(drive.core.sense(drive.now_ns + k * 2_000_000, frames))
+    assert [state and state.seq for state in states] == [seq + 1, None, None]
+    assert drive.tick().output.state is states[0]
+    assert drive.tick().output.state.seq == seq + 2
+
+
 def test_heartbeat_every_100_ms():
     drive = GatewayDrive().arm()
     heartbeat_id = drive.catalogue.by_name["GW_Heartbeat"].arbitration_id
@@ -253,9 +367,9 @@ def test_no_demand_ever_breaks_a_limit(steers, drives, vx_mps):
             told = drive.car.told
             angle_deg = told["SR_Command"]["AngleCommand"]
             assert abs(angle_deg - previous_deg) <= 800.0 * TICK_NS * 1e-9 + 0.05
-            if vx_mps > 1.0:
+            if drive.car.vx_mps > 1.0:
                 road_wheel = math.radians(angle_deg) / 14.7
-                assert vx_mps**2 * math.tan(abs(road_wheel)) / 2.648 <= 15.0 * 1.01 + 0.05
+                assert drive.car.vx_mps**2 * math.tan(abs(road_wheel)) / 2.648 <= 15.0 * 1.01 + 0.05
             assert not (told["AR_Command"]["PositionCommand"] > 0 and told["BR_Command"]["PositionCommand"] > 0)
             previous_deg = angle_deg
     assert drive.core.mode is Mode.ENGAGED
