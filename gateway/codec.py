@@ -1,7 +1,7 @@
 """Bus values to SI and back: the only module of the gateway that knows message and signal names, degrees and per cent."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dbc.catalogue import Catalogue, CatalogueError, EncodeError
 from dbc.e2e import E2EProtector
@@ -155,8 +155,8 @@ class Codec:
         """Use every signal and every table entry once, so that a site's DBC that lacks one is refused now, not on the road."""
         self.update(Measurement(), {name: dict.fromkeys(self._catalogue.signals(name), 0.0) for name in NEEDED_MESSAGES})
         for mode in Mode:
-            self.encode(0, mode, Demand(0.0, 0.0, 0.0), Cycle(0.0, 0, 0, is_navigation_valid=True))
-            self.encode_monitors(0, Monitors(0.0, 0, mode, Finding(Cause.TICK_GAP, 0.0, 0.0, "")))
+            self.encode(_REHEARSAL_NS, mode, _REHEARSED_DEMAND, _REHEARSED_CYCLE)
+            self.encode_monitors(_REHEARSAL_NS, replace(_REHEARSED_MONITORS, mode=mode))
 
     def update(self, measurement: Measurement, values: dict[str, dict[str, float]]) -> None:
         """Take the newest values of each message into the measurement."""
@@ -236,6 +236,11 @@ class Codec:
             payload = protector.protect(payload)
         return CanFrame(self._catalogue.by_name[name].arbitration_id, payload, now_ns)
 
+
+_REHEARSAL_NS = 0
+_REHEARSED_DEMAND = Demand(0.0, 0.0, 0.0)
+_REHEARSED_CYCLE = Cycle(0.0, 0, 0, is_navigation_valid=True)
+_REHEARSED_MONITORS = Monitors(0.0, 0, Mode.SILENT, Finding(Cause.TICK_GAP, 0.0, 0.0, ""))
 
 _REQUEST_OF_MODE = {
     Mode.SILENT: "None",

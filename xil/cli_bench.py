@@ -94,6 +94,17 @@ def bench_gateway(
     show(result if as_json else gateway_bench.to_table(result), as_json)
 
 
+@bench.command("latency")
+def bench_latency(
+    seconds: Annotated[float, typer.Option(min=1.0, help="of traffic that is measured")] = 10.0, as_json: JsonOption = False
+) -> None:
+    """From a frame to the state at the controller, and from a command to the frame on the bus, with real processes."""
+    from xil import bench_latency as latency_bench  # noqa: PLC0415
+
+    result = latency_bench.bench_latency(seconds)
+    show(result if as_json else latency_bench.to_table(result), as_json)
+
+
 @bench.command("plant")
 def bench_plant(
     vehicle: VehicleOption = FOCUS,

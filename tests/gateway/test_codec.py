@@ -12,7 +12,7 @@ from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, 
 from gateway.limits import Demand
 from gateway.messages import Mode
 
-LIMITS = RobotLimits(steering_wheel_rate_radps=10.0, max_speed_mps=36.0)
+LIMITS = RobotLimits(steering_wheel_rate_radps=10.0, max_speed_mps=36.0, pedal_rate_mps=0.5049)
 CATALOGUE = load()
 CYCLE = Cycle(command_age_ms=40.0, measurement_id=11, watchdog_question=0x12, is_navigation_valid=True)
 DEMAND = Demand(steering_wheel_rad=0.5, accelerator_norm=0.25, brake_norm=0.75)
@@ -213,11 +213,11 @@ def test_what_the_robots_are_told(mode, request_raw):
             "TorqueFeedForward": 0, "ClearFault": 0,
         },
         "AR_Command": {
-            "Mode": 2 if is_active else 1, "Enable": is_active, "PositionCommand": 25, "RateLimit": 1000, "ForceLimit": 200,
+            "Mode": 2 if is_active else 1, "Enable": is_active, "PositionCommand": 25, "RateLimit": 500, "ForceLimit": 200,
             "ForceCommand": 0, "ClearFault": 0,
         },
         "BR_Command": {
-            "Mode": 2 if is_active else 1, "Enable": is_active, "PositionCommand": 75, "RateLimit": 1000, "ForceLimit": 1000,
+            "Mode": 2 if is_active else 1, "Enable": is_active, "PositionCommand": 75, "RateLimit": 500, "ForceLimit": 1000,
             "ForceCommand": 0, "ClearFault": 0,
         },
     }  # fmt: skip

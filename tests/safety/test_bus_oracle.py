@@ -262,7 +262,7 @@ def _window():
     script = Script().engage()
     script.speed_mps = 0.0
     script.tick(20)
-    for _ in range(30):
+    for _ in range(50):
         script.angle_deg += 7.0
         script.now_ns += 2 * MS
         script.speak()
