@@ -215,7 +215,6 @@ def blockers(s: Situation, found: Sequence[Finding]) -> list[str]:
     conditions = (
         (not m.are_robots_ready, "robots not ready"),
         (not m.is_dead_man_pressed, "dead-man not pressed"),
-        (s.commands.good_in_a_row < READY_COMMANDS, f"{s.commands.good_in_a_row} good commands in a row, {READY_COMMANDS} needed"),
         (not s.surroundings.is_recording, "recorder does not record"),
         (
             s.surroundings.disk_free_share < MIN_DISK_FREE,
@@ -231,9 +230,18 @@ def blockers(s: Situation, found: Sequence[Finding]) -> list[str]:
     return blocked
 
 
-def settling(good_ns: int) -> list[str]:
-    """That nothing has been in the way for too short a time [ns]; empty when it is long enough."""
-    return [f"everything good for {good_ns * 1e-9:.1f} s, {HOLD_NS * 1e-9:.1f} s needed"] if good_ns < HOLD_NS else []
+def settling(good_ns: int, good_commands: int) -> list[str]:
+    """What has been good for too short a time; empty when all has been for long enough.
+
+    Args:
+        good_ns: time for which nothing has been in the way [ns].
+        good_commands: of status OK, in a row.
+    """
+    conditions = (
+        (good_commands < READY_COMMANDS, f"{good_commands} good commands in a row, {READY_COMMANDS} needed"),
+        (good_ns < HOLD_NS, f"everything good for {good_ns * 1e-9:.1f} s, {HOLD_NS * 1e-9:.1f} s needed"),
+    )
+    return [name for is_true, name in conditions if is_true]
 
 
 def untimely(request: OperatorRequest, now_ns: int, last_ns: int) -> str:

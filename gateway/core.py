@@ -98,7 +98,7 @@ class GatewayCore:
         self._is_state_good = False
         self._sensed: VehicleState | None = None
         self._asked_ns = 0
-        self._engaged_since_ns = 0
+        self._engaged_since_ns: int | None = None
         self._stop_since_ns: int | None = None
         self._state_times_ns = [0] * _REMEMBERED_STATES
         self._measurement_id = 0
@@ -171,9 +171,9 @@ class GatewayCore:
         m = self.measurement
         before = (m.navigation_time_ms, m.watchdog_question, m.measurement_id)
         self._codec.update(m, self.supervisor.observe(frames))
-        if m.navigation_time_ms != before[0]:
+        if m.navigation_time_ms != before[0] and (arrival_ns := self.supervisor.arrival_ns(_TIME_MESSAGE)) is not None:
             # Only a new time of validity makes the state young: a frozen navigation system grows old.
-            self._state_time_ns = self.supervisor.arrival_ns(_TIME_MESSAGE) or 0
+            self._state_time_ns = arrival_ns
         if m.watchdog_question != before[1]:
             self._asked_ns = now_ns
         if m.measurement_id != before[2]:
@@ -187,7 +187,7 @@ class GatewayCore:
 
     def _situation(self, now_ns: int, surroundings: Surroundings) -> Situation:
         m, is_driving = self.measurement, self.mode in DRIVING
-        is_settled = now_ns - self._engaged_since_ns > ENGAGE_GRACE_NS
+        is_settled = self._engaged_since_ns is not None and now_ns - self._engaged_since_ns > ENGAGE_GRACE_NS
         observed = self.supervisor.findings(now_ns)
         unsound = unsound_messages(observed)
         contradictions = self._plausibility.update(now_ns, m, self.actuation.demand, is_driving and is_settled)
@@ -225,7 +225,7 @@ class GatewayCore:
             return blocked
         if self._good_since_ns is None:
             self._good_since_ns = situation.now_ns
-        return settling(situation.now_ns - self._good_since_ns)
+        return settling(situation.now_ns - self._good_since_ns, self.commands.good_in_a_row)
 
     def _refusals(self, request: OperatorRequest, situation: Situation, last_ns: int) -> list[str]:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""

@@ -4,6 +4,7 @@
 """
 
 import copy
+import random
 from functools import cache
 
 import pytest
@@ -11,12 +12,14 @@ from hypothesis import HealthCheck, Phase, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
+from gateway.limits import PROFILES
 from gateway.messages import Mode, Operation, OperatorRequest
 from tests.support.campaign import MS, TICK_NS, World
 from tests.support.engagement import CONDITIONS, SETTLED_TICKS, Rules, surroundings_of
 
 SEQUENCES, STEPS = 500, 50
 SEQUENCES_LONG, STEPS_LONG = 20_000, 100
+STARTS, STARTS_LONG, START_TICKS = 300, 10_000, 30
 
 
 @cache
@@ -127,6 +130,35 @@ def run(sequences, steps):
         max_examples=sequences, stateful_step_count=steps, deadline=None, database=None, derandomize=True, print_blob=False,
         suppress_health_check=list(HealthCheck), phases=[Phase.generate, Phase.shrink],
     ))
+
+
+def start(seed):
+    """A gateway that has just started, while anything may be wrong and anything is asked for; the oracle watches what it sends."""
+    rng = random.Random(f"start/{seed}")
+    world = World(seed, rng.choice(sorted(PROFILES)), rng.uniform(0.0, 8.0))
+    surroundings_of(world)
+    rules = Rules(world, 0)
+    world.controller.steer_rad, world.controller.drive_norm = rng.uniform(-0.5, 0.5), rng.uniform(-1.0, 1.0)
+    for name in rng.sample(sorted(CONDITIONS), rng.randrange(4)):
+        rules.switch(name)
+    enabled = 0
+    for _ in range(START_TICKS):
+        operation = rng.choice([None, None, None, *Operation])
+        if operation is not None:
+            world.ask(operation)
+        rules.step(operation)
+        enabled += world.mode not in (Mode.SILENT, Mode.STANDBY, Mode.READY)
+        if world.mode is Mode.SILENT:
+            assert world.sent == [], f"seed {seed}"
+    assert not rules.complaints, f"seed {seed}: {rules.complaints[0]}"
+    return enabled
+
+
+@pytest.mark.req("E1")
+@pytest.mark.parametrize("starts", [STARTS, pytest.param(STARTS_LONG, marks=[pytest.mark.long, pytest.mark.timeout(3_600)])])
+def test_nothing_is_sent_and_nothing_moves_before_it_is_asked_for(starts, figure):
+    assert sum(start(seed) for seed in range(starts)) == 0  # 0.3 s are too short for a second of good conditions
+    figure(f"E1: {starts} random starts, 0 violations")
 
 
 @pytest.mark.req("E1", "E2", "E3", "E4", "G1")

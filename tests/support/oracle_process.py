@@ -36,15 +36,22 @@ class Listener:
         interface, _, channel = bus_name.partition(":")
         self.network = network
         self._bus = can.Bus(channel=channel, interface=interface, ignore_config=True)
-        # The emulated bus stamps frames with CLOCK_MONOTONIC, the kernel with CLOCK_REALTIME.
-        self._offset_ns = 0 if interface == "xilgate" else time.time_ns() - time.monotonic_ns()
+        self._ahead_ns = time.time_ns() - time.monotonic_ns()
+        self._offset_ns: int | None = None
 
     def frames(self) -> Iterator[tuple[int, int, bytes]]:
         """What has come: time [ns], identifier, payload."""
         while (message := self._bus.recv(timeout=0)) is not None:
             if not (message.is_error_frame or message.is_remote_frame):
                 identifier = message.arbitration_id | (1 << 31 if message.is_extended_id else 0)
-                yield round(message.timestamp * 1e9) - self._offset_ns, identifier, bytes(message.data)
+                yield self._monotonic_ns(round(message.timestamp * 1e9)), identifier, bytes(message.data)
+
+    def _monotonic_ns(self, stamp_ns: int) -> int:
+        """A time stamp in CLOCK_MONOTONIC; the kernel stamps frames with CLOCK_REALTIME, other interfaces with either."""
+        if self._offset_ns is None:
+            is_realtime = abs(stamp_ns - time.time_ns()) < abs(stamp_ns - time.monotonic_ns())
+            self._offset_ns = self._ahead_ns if is_realtime else 0
+        return stamp_ns - self._offset_ns
 
     def close(self) -> None:
         """Leave the bus."""

@@ -73,7 +73,7 @@ def trial(out):
     drive = Drive(out)
     try:
         with StallProbe() as probe:
-            drive.wait_for(lambda state: state.mode != "STANDBY", "readiness")
+            drive.wait_for(lambda state: state.mode in ("READY", "ENGAGED"), "readiness")
             assert drive.children.keys() == EVERYONE
             output, _ = drive.process.communicate(timeout=90)
         assert drive.is_gone()
@@ -126,7 +126,7 @@ def test_whoever_is_killed_ends_the_run_and_is_named(drive, victim):
 
 
 @pytest.mark.parametrize("victim", ["robots", "navigation"])
-def test_a_bus_that_dies_alone_stops_the_car_and_is_named(tmp_path, victim):
+def test_a_bus_that_dies_alone_ends_the_engagement_and_is_named(tmp_path, victim):
     channels = {network: f"alone-{os.getpid()}-{network}" for network in ("robots", "navigation")}
     hubs = {network: start_xilgate("bus", channel) for network, channel in channels.items()}
     wait_until(lambda: all(map(is_served, channels.values())), 20, "both buses")
@@ -137,7 +137,7 @@ def test_a_bus_that_dies_alone_stops_the_car_and_is_named(tmp_path, victim):
         assert drive.children.keys() == EVERYONE - {"bus"}
         assert drive.status.dead_buses == []
         hubs[victim].kill()
-        wait_until(lambda: drive.state.mode == "SAFE_STOP", 5, "the safe stop")
+        wait_until(lambda: drive.state.mode == "FAULT", 5, "the fault")
         wait_until(lambda: drive.status.dead_buses == [victim], 5, "the name of the bus")
         assert drive.process.poll() is None
         drive.process.send_signal(signal.SIGINT)
