@@ -116,7 +116,7 @@ class TuningService:
         """The answer to one request; to what is none, a refusal that says why."""
         try:
             request = _REQUESTS.decode(payload)
-        except (msgspec.DecodeError, RecursionError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             return self._encoder.encode(Refused(reasons=[f"not a request: {error}"]))
         with self._lock:
             return self._encoder.encode(self._answer(request))
@@ -169,5 +169,5 @@ def request(content: Request, base_port: int = DEFAULT_BASE_PORT) -> Answer:
     answer = ask(Source.CONTROLLER, SERVICE, msgspec.json.encode(content), base_port)
     try:
         return _ANSWERS.decode(answer)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise TelemetryError(f"the controller's answer is none: {error}; is it of another version?") from error

@@ -180,14 +180,13 @@ def _make(work: Path, recipe: Recipe, compiler: Compiler, progress: Callable[[st
 
 
 def _publish(work: Path, directory: Path, name: str) -> None:
-    if _load(directory, name):
-        return  # another process was faster
-    shutil.rmtree(directory, ignore_errors=True)
     try:
-        work.rename(directory)
+        work.rename(directory)  # fails where there is one already
     except OSError:
-        if not _load(directory, name):
-            raise
+        if _load(directory, name):
+            return  # another process was faster
+        shutil.rmtree(directory, ignore_errors=True)
+        work.rename(directory)
 
 
 def _load(directory: Path, name: str) -> Build | None:

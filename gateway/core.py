@@ -88,7 +88,7 @@ class GatewayCore:
         self._navigation_timeout_ns = catalogue.by_name[_TIME_MESSAGE].timeout_ns
         self._monitor_ticks = catalogue.by_name["GW_Status"].cycle_time_ns // TICK_NS
         self._modes = ModeMachine()
-        self._plausibility = Plausibility(vehicle)
+        self._plausibility = Plausibility(vehicle, is_on_lift=not profile.are_wheels_on_the_road)
         self._gate = TransmitGate(catalogue)
         self._safe_stop: SafeStop | None = None
         self._last_step_ns: int | None = None
@@ -222,10 +222,10 @@ class GatewayCore:
         blocked = blockers(situation, self.findings)
         if blocked:
             self._good_since_ns = None
-            return blocked
-        if self._good_since_ns is None:
+        elif self._good_since_ns is None:
             self._good_since_ns = situation.now_ns
-        return settling(situation.now_ns - self._good_since_ns, self.commands.good_in_a_row)
+        good_ns = 0 if self._good_since_ns is None else situation.now_ns - self._good_since_ns
+        return blocked + settling(good_ns, self.commands.good_in_a_row)
 
     def _refusals(self, request: OperatorRequest, situation: Situation, last_ns: int) -> list[str]:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""

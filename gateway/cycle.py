@@ -124,10 +124,11 @@ class ControlCycle:
             self._links.operators.reply(reply)
 
     def _request(self, now_ns: int) -> OperatorRequest | None:
-        """What has to be done before the process may end, else what an operator wants."""
-        if self._ending is not None and (operation := self._ending.request(self._core.mode)) is not None:
+        """What an operator wants, or what has to be done before the process may end."""
+        request = self._links.operators.next_request()
+        if request is None and self._ending is not None and (operation := self._ending.request(self._core.mode)) is not None:
             return OperatorRequest(self._boot_id, self._core.ticks, operation, now_ns)
-        return self._links.operators.next_request()
+        return request
 
     def _tell(self, now_ns: int, output: StepOutput, overruns: int, cpu_ns: int) -> None:
         if output.transition is not None:

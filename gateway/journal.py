@@ -24,8 +24,8 @@ if TYPE_CHECKING:  # whoever keeps records does not need the core
 
 FORMAT = 1
 """Number of the layout of blocks and sessions."""
-MAX_RECORD_BYTES = 1 << 18
-"""Longest record [bytes]: ten times a step with all the frames that one poll of every bus can bring."""
+MAX_RECORD_BYTES = 1 << 20
+"""Longest record [bytes]: a session with a path of some kilometres, or forty times a step with all that one poll of every bus can bring."""
 
 _BLOCK = struct.Struct("<4sIII")  # magic, length of the compressed records, of the records, CRC-32 of the compressed ones
 _MAGIC = b"XGJ1"

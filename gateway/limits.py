@@ -16,7 +16,7 @@ counter-steers needs angles that no tyre can follow. From straight they are ther
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +47,7 @@ class LimitProfile:
         comfort_stop, safe_stop: the two grades of a stop.
         max_speed_mps: largest speed at which the gateway drives.
         standstill_brake_norm: brake pedal that holds the car after a stop, share of the stroke.
+        are_wheels_on_the_road: whether their speed is that of the car; on a lift nothing tells a virtual car from a fault.
     """
 
     name: str
@@ -62,6 +63,7 @@ class LimitProfile:
     safe_stop: StopGrade
     max_speed_mps: float
     standstill_brake_norm: float
+    are_wheels_on_the_road: bool = True
 
 
 NOMINAL = LimitProfile(
@@ -110,9 +112,13 @@ BENCH = LimitProfile(
     safe_stop=EMERGENCY_STOP,
     max_speed_mps=8.4,  # 30 km/h
     standstill_brake_norm=0.3,  # as nominal
+    are_wheels_on_the_road=False,
 )
 
-PROFILES: Mapping[str, LimitProfile] = {profile.name: profile for profile in (NOMINAL, PROVING_GROUND, BENCH)}
+LIFTED = replace(PROVING_GROUND, name="lifted", are_wheels_on_the_road=False)
+"""What a virtual car drives on the proving ground while the real one hangs on a lift."""
+
+PROFILES: Mapping[str, LimitProfile] = {profile.name: profile for profile in (NOMINAL, PROVING_GROUND, LIFTED, BENCH)}
 """By name; one is chosen at the start of the gateway and stays."""
 
 

@@ -153,7 +153,7 @@ class OperatorReply:
 
 Datagram = VehicleState | ControlCommand | OperatorRequest | OperatorReply
 
-_STATE = struct.Struct("<QB?9d")
+_STATE = struct.Struct("<QBB9d")
 _COMMAND = struct.Struct(f"<QQBQ4d{HORIZON_STEPS}d{HORIZON_STEPS}d")
 _REQUEST = struct.Struct("<BQ")
 _REPLY = struct.Struct("<BB")
@@ -222,10 +222,10 @@ def _body(message: Datagram) -> tuple[Kind, bytes]:
 
 
 def _message(kind: int, boot_id: int, seq: int, content: bytes) -> Datagram | None:
-    """What a datagram of the right length says; None when a number in it is not finite."""
+    """What a datagram of the right length says; None when a number in it is not finite, or a yes or no neither."""
     if kind == Kind.VEHICLE_STATE:
         t_ns, mode, is_valid, *numbers = _STATE.unpack_from(content, _HEADER.size)
-        return VehicleState(boot_id, seq, t_ns, Mode(mode), is_valid, *numbers) if _finite(numbers) else None
+        return VehicleState(boot_id, seq, t_ns, Mode(mode), bool(is_valid), *numbers) if is_valid in (0, 1) and _finite(numbers) else None
     if kind == Kind.CONTROL_COMMAND:
         state_seq, t_ns, status, solve_time_ns, *numbers = _COMMAND.unpack_from(content, _HEADER.size)
         lateral_error_m, heading_error_rad, steer_rad, drive_norm, *plan = numbers

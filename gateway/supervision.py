@@ -77,7 +77,7 @@ class Flow:
 
     def __init__(self, specs: Iterable[MessageSpec]) -> None:
         cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if spec.cycle_time_ns and spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS}
-        self._names = cycles_ns.keys()
+        self._names = frozenset(cycles_ns)
         self._frames_per_ns = sum(1.0 / cycle_ns for cycle_ns in cycles_ns.values())
         self._jitter_frames = len(cycles_ns)  # one of each message may just be on its way
         self._good = 0

@@ -32,7 +32,7 @@ PURE_MODULES = {
     ),
     "gateway": (
         *("messages", "codec", "supervision", "commands", "conditions", "modes"),
-        *("limits", "actuation", "safe_stop", "core", "journal"),
+        *("limits", "actuation", "safe_stop", "transmit", "plausibility", "latency", "core", "journal"),
     ),
     "controller": (
         *("problem", "model", "integrator", "ocp", "delay", "disturbance", "estimator", "nmpc", "fallback", "parameters", "objects"),

@@ -69,7 +69,7 @@ class EmulatorService:
         """The answer to one request; to what is none, a refusal that says why."""
         try:
             request = _REQUESTS.decode(payload)
-        except (msgspec.DecodeError, RecursionError) as error:
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             return msgspec.json.encode(Refused(reason=f"not a request: {error}"))
         try:
             answer: Answer = Done(result=self._done(request))
@@ -116,7 +116,7 @@ def request(op: str, arguments: Mapping[str, object], base_port: int = DEFAULT_B
     payload = ask(Source.EMULATOR, SERVICE, msgspec.json.encode(Request(op=op, arguments=dict(arguments))), base_port)
     try:
         answer = _ANSWERS.decode(payload)
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
         raise TelemetryError(f"the emulator's answer is none: {error}; is it of another version?") from error
     if isinstance(answer, Refused):
         raise UserMistake(answer.reason)

@@ -184,7 +184,7 @@ class _Bench:
         end_ns = time.monotonic_ns() + round(seconds * 1e9)
         while (now_ns := time.monotonic_ns()) < end_ns:
             due_ns = end_ns if self._answer is None else min(end_ns, self._answer[0])
-            select.select([robots, navigation, channel], [], [], max(due_ns - now_ns, 0) * 1e-9)
+            select.select([robots.fileno(), navigation.fileno(), channel.fileno()], [], [], max(due_ns - now_ns, 0) * 1e-9)
             for frame in navigation.receive():
                 if frame.arbitration_id == self._time_id:
                     self._heard_ns = frame.t_ns

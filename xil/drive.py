@@ -23,7 +23,6 @@ from dbc.catalogue import load
 from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import load_vehicle
 from gateway.core import GatewayCore
-from gateway.limits import PROVING_GROUND
 from gateway.telemetry import StateSample
 from vehicle_emulator.emulator import Emulator
 from vehicle_emulator.faults.targets import check
@@ -249,7 +248,7 @@ def _configuration(setup: RunSetup) -> dict[str, object]:
         "dbc": [str(path) for path in setup.dbc_paths],
         "vehicle": setup.vehicle.model_dump(),
         "ocp": asdict(OcpOptions(model=DRIVE_MODEL)),
-        "limits": asdict(PROVING_GROUND),
+        "limits": asdict(setup.profile),
     }
 
 

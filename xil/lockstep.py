@@ -18,7 +18,6 @@ from dbc.errors import SetupFailure
 from dbc.frame import CanFrame
 from gateway.core import TICK_NS, GatewayCore
 from gateway.journal import StepArguments
-from gateway.limits import PROVING_GROUND
 from gateway.messages import PLAN_PERIOD_NS, ControlCommand, OperatorRequest
 from gateway.record.session import gateway_session
 from gateway.samples import GatewaySampler, Process
@@ -48,7 +47,7 @@ def journals_of(setup: RunSetup) -> Journals:
     """The journals of a run, in its directory, in which the inputs of the run are already."""
     return Journals(
         setup.directory,
-        gateway_session(_GATEWAY_BOOT_ID, PROVING_GROUND, setup.dbc_paths, setup.vehicle_path, {"stage": setup.stage.value}),
+        gateway_session(_GATEWAY_BOOT_ID, setup.profile, setup.dbc_paths, setup.vehicle_path, {"stage": setup.stage.value}),
         controller_session(_CONTROLLER_BOOT_ID, setup.solver, None, setup.reference_csv, setup.vehicle_path),
     )
 
@@ -85,7 +84,7 @@ class LockstepRun:
         self._emulator = Emulator(setup.emulator, setup.catalogue, START_NS)
         self._world = World(setup.scenario, setup.vehicle, START_NS)
         self._objects = self._world.sample(START_NS, 0, pose)
-        self._gateway = GatewayCore(setup.catalogue, setup.vehicle, _GATEWAY_BOOT_ID)
+        self._gateway = GatewayCore(setup.catalogue, setup.vehicle, _GATEWAY_BOOT_ID, setup.profile)
         self._nmpc = self._make_nmpc(solver, options or NmpcOptions(), journals)
         self._journals = journals
         self._operator = Operator(setup.scenario.time_limit_s, setup.scenario.course(setup.vehicle).is_at_end)

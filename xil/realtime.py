@@ -135,7 +135,8 @@ class RealtimeRun:
         if setup.view_port is not None:
             processes.start("view", ["view", "--port", str(setup.view_port), *telemetry])
             self._announce(f"virtual world: http://127.0.0.1:{setup.view_port}/")
-        processes.start("gateway", ["gateway", *buses, *contract, *sockets, "--record", str(setup.directory)])
+        limits, record = ["--profile", setup.profile.name], ["--record", str(setup.directory)]
+        processes.start("gateway", ["gateway", *buses, *contract, *sockets, *limits, *record])
         reference = ["--reference", str(setup.reference_csv), "--solver", setup.solver]
         journal = ["--journal", str(setup.directory)]
         processes.start("controller", ["controller", *reference, *vehicle, *telemetry, *sockets, *journal])

@@ -6,6 +6,7 @@ from pathlib import Path
 from dbc.build import Build
 from dbc.catalogue import Catalogue
 from dbc.vehicle import Vehicle
+from gateway.limits import LIFTED, PROVING_GROUND, LimitProfile
 from vehicle_emulator.emulator import DEFAULT_PLANT, EmulatorSetup, StartPose
 from xil.bus import BusChoice
 from xil.scenario import Scenario, Stage
@@ -52,6 +53,11 @@ class RunSetup:
             faults=self.scenario.faults,
             seed=self.seed,
         )
+
+    @property
+    def profile(self) -> LimitProfile:
+        """What the gateway lets through."""
+        return LIFTED if self.is_lifted else PROVING_GROUND
 
     @property
     def bus_log(self) -> Path:

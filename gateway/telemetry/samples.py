@@ -353,5 +353,5 @@ def decode(topic: str, payload: bytes) -> Sample | None:
         return None
     try:
         return msgspec.json.decode(payload, type=TOPICS[topic][1])
-    except (msgspec.DecodeError, RecursionError, KeyError):
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError, KeyError):
         return None

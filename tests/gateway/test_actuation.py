@@ -553,6 +553,7 @@ def test_no_sequence_of_demands_breaks_a_limit(profile, car, start, asked, hold,
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1800)  # a minute of processor time, on a shared machine
 @pytest.mark.req("G1")
 @given(**sequences)
 @settings(max_examples=20_000, deadline=None)

@@ -1,7 +1,9 @@
 """The gateway in closed loop with a stub car, in virtual time: engagement, hand-over, stops, limits."""
 
+import copy
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import pytest
@@ -14,6 +16,26 @@ from gateway.causes import Cause, Finding
 from gateway.core import ENGAGE_GRACE_NS, TICK_NS
 from gateway.messages import CommandStatus, Mode, Operation
 from tests.support.drive import GatewayDrive
+
+
+@cache
+def _prepared(mode):
+    return GatewayDrive().arm() if mode is Mode.READY else GatewayDrive().engage()
+
+
+def _twin(drive):
+    """A copy that goes on alone: to drive to where a test begins takes longer than the test."""
+    catalogue = drive.catalogue
+    shared = (catalogue, *catalogue.by_name.values(), drive.core.profile, drive.core.actuation._vehicle)
+    return copy.deepcopy(drive, {id(thing): thing for thing in shared})
+
+
+def armed():
+    return _twin(_prepared(Mode.READY))
+
+
+def engaged():
+    return _twin(_prepared(Mode.ENGAGED))
 
 
 def test_state_is_si_and_iso_8855():
@@ -61,7 +83,7 @@ def test_neutral_until_engaged():
 
 
 def test_engagement_needs_the_operator_and_acts_once_per_request():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     drive.ask(Operation.DISENGAGE)
     drive.tick()
     assert drive.core.mode is Mode.STANDBY
@@ -136,7 +158,7 @@ def test_accelerator_waits_for_the_brake_pedal():
 
 
 def test_one_missed_command_is_tolerated_two_are_not():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     while drive._ticks % 4 != 1:
         drive.tick()  # the controller has just answered
     drive.is_controller_alive = False
@@ -151,7 +173,7 @@ def test_one_missed_command_is_tolerated_two_are_not():
 
 
 def test_silent_controller_stops_the_car_within_120_ms():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     while drive._ticks % 4 != 1:
         drive.tick()
     last_command_ns = drive.now_ns
@@ -203,7 +225,7 @@ def test_safe_stop_follows_the_tail_of_the_plan():
     ],
 )
 def test_every_fault_ends_the_engagement_with_its_name(break_it, cause, mode):
-    drive = GatewayDrive().engage().tick(50)
+    drive = engaged().tick(50)
     assert drive.core.mode is Mode.ENGAGED
     break_it(drive)
     drive.tick(20)
@@ -214,7 +236,7 @@ def test_every_fault_ends_the_engagement_with_its_name(break_it, cause, mode):
 
 
 def test_reset_leaves_a_safe_stop_and_allows_a_new_engagement():
-    drive = GatewayDrive().engage().tick(50)
+    drive = engaged().tick(50)
     drive.status = CommandStatus.FAILED
     drive.tick(10)
     assert drive.core.mode is Mode.SAFE_STOP
@@ -231,7 +253,7 @@ def test_reset_leaves_a_safe_stop_and_allows_a_new_engagement():
 
 
 def test_a_stop_is_not_reset_because_of_a_speed_that_the_wheels_contradict():
-    drive = GatewayDrive().engage().tick(50)
+    drive = engaged().tick(50)
     drive.car.vx_mps, drive.car.wheel_speed_offset_mps = 0.0, 20.0
     drive.tick(20)
     assert drive.transitions[-1].finding.cause is Cause.SPEED_IMPLAUSIBLE
@@ -265,7 +287,7 @@ def test_pedals_that_are_not_told_any_more_are_no_foot(drive_norm):
 @pytest.mark.req("E3", "F7")
 @pytest.mark.parametrize(("lie", "message"), [({"override_of": {"BR"}}, "BR_Status"), ({"override": 1}, "RC_SafetyStatus")])
 def test_a_message_that_is_invalid_does_not_hand_the_car_over(lie, message):
-    drive = GatewayDrive().engage().tick(50)
+    drive = engaged().tick(50)
     drive.car.corrupt = {message}
     drive.tick(4)
     assert drive.transitions[-1].finding.cause is Cause.MESSAGE_INVALID
@@ -279,7 +301,7 @@ def test_a_message_that_is_invalid_does_not_hand_the_car_over(lie, message):
 
 
 def test_a_stop_begins_with_what_is_asked_for_not_with_a_sample_of_the_accelerometer():
-    drive = GatewayDrive().engage().tick(50)
+    drive = engaged().tick(50)
     drive.car.acceleration_mps2 = -9.0
     drive.ask(Operation.STOP)
     drive.tick()
@@ -324,7 +346,7 @@ def test_a_second_controller_does_not_take_the_place_of_one_that_lives():
 
 @pytest.mark.req("E2")
 def test_a_request_that_is_made_while_a_step_is_under_way_is_heard():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     drive.ask(Operation.DISENGAGE)
     drive._to_send = replace(drive._to_send, t_ns=drive.now_ns + TICK_NS + 300_000)  # after the time that the step goes by
     drive.tick()
@@ -389,7 +411,7 @@ def test_what_was_asked_before_the_gateway_lived_does_not_act(younger_ns, refusa
 
 @pytest.mark.req("S2")
 def test_a_request_acts_once():
-    drive = GatewayDrive().arm()
+    drive = armed()
     drive.ask(Operation.DISENGAGE)
     asked = drive._to_send
     drive.tick()
@@ -402,7 +424,7 @@ def test_a_request_acts_once():
 
 
 def test_a_stop_from_the_future_does_not_hold_up_what_is_asked_now():
-    drive = GatewayDrive().arm()
+    drive = armed()
     drive.ask(Operation.STOP)
     drive._to_send = replace(drive._to_send, t_ns=drive.now_ns + 10**12)
     drive.tick()
@@ -417,14 +439,14 @@ def test_a_stop_from_the_future_does_not_hold_up_what_is_asked_now():
 @pytest.mark.parametrize(
     ("prepare", "possible"),
     [
-        (GatewayDrive.tick, {Operation.ARM, Operation.RESET}),
-        (GatewayDrive.arm, {Operation.ENGAGE, Operation.DISENGAGE, Operation.STOP}),
-        (GatewayDrive.engage, {Operation.DISENGAGE, Operation.STOP}),
+        (lambda: GatewayDrive().tick(), {Operation.ARM, Operation.RESET}),
+        (armed, {Operation.ENGAGE, Operation.DISENGAGE, Operation.STOP}),
+        (engaged, {Operation.DISENGAGE, Operation.STOP}),
     ],
 )
 def test_what_may_be_asked_for_in_a_mode(prepare, possible):
     for operation in Operation:
-        drive = prepare(GatewayDrive())
+        drive = prepare()
         mode = drive.core.mode
         drive.ask(operation)
         drive.tick()
@@ -433,7 +455,7 @@ def test_what_may_be_asked_for_in_a_mode(prepare, possible):
 
 def test_what_the_operator_ends_is_told_as_his_doing():
     for operation, cause in ((Operation.DISENGAGE, Cause.OPERATOR_DISENGAGE), (Operation.STOP, Cause.OPERATOR_STOP)):
-        drive = GatewayDrive().engage()
+        drive = engaged()
         assert drive.core.disengagement is None
         drive.ask(operation)
         drive.tick()
@@ -442,7 +464,7 @@ def test_what_the_operator_ends_is_told_as_his_doing():
 
 
 def test_only_the_end_of_an_engagement_is_a_disengagement():
-    drive = GatewayDrive().arm()
+    drive = armed()
     drive.car.dead_man = 0
     drive.tick()
     assert (drive.core.mode, drive.core.disengagement) == (Mode.STANDBY, None)
@@ -455,7 +477,7 @@ def test_only_the_end_of_an_engagement_is_a_disengagement():
 
 
 def test_a_reset_is_no_second_disengagement():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     drive.ask(Operation.STOP)
     drive.tick()
     ended = drive.core.disengagement
@@ -493,7 +515,7 @@ def test_what_bus_monitors_are_told_every_100_ms():
 
 @pytest.mark.req("F10")
 def test_in_a_fault_only_bus_monitors_hear_something():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     drive.car.emergency_stop = 1
     drive.tick(2)
     assert drive.core.mode is Mode.FAULT
@@ -504,7 +526,7 @@ def test_in_a_fault_only_bus_monitors_hear_something():
 
 
 def test_the_safety_command_tells_age_measurement_and_limits():
-    drive = GatewayDrive().arm()
+    drive = armed()
     ids = []
     for _ in range(8):
         told = drive.tick().car.told["GW_SafetyCommand"]
@@ -529,7 +551,7 @@ def test_before_any_command_there_is_no_measurement():
 
 @pytest.mark.parametrize("lag", range(11))
 def test_the_age_at_actuation_is_that_of_the_state_that_was_answered(lag):
-    drive = GatewayDrive().arm()
+    drive = armed()
     drive.command = lambda: replace(GatewayDrive.command(drive), state_seq=drive.core.ticks - lag)
     drive.tick(8)
     # One period from the state to the command, one from the robots' acting on it to their status.
@@ -612,7 +634,7 @@ def test_everything_has_to_be_good_for_a_second_without_a_break():
 
 @pytest.mark.req("F13")
 def test_a_gap_between_two_steps_is_told_from_the_step_before():
-    drive = GatewayDrive().engage().tick(10)
+    drive = engaged().tick(10)
     drive.now_ns += 50 * 1_000_000
     drive.tick()
     assert drive.transitions[-1].finding == Finding(Cause.TICK_GAP, 60.0, 50.0, "gateway")
@@ -620,7 +642,7 @@ def test_a_gap_between_two_steps_is_told_from_the_step_before():
 
 @pytest.mark.parametrize(("mode", "acceleration_mps2", "jerk_mps3"), [(Mode.COMFORT_STOP, -1.0, 0.3), (Mode.SAFE_STOP, -2.5, 1.5)])
 def test_how_firmly_each_stop_brakes(mode, acceleration_mps2, jerk_mps3):
-    drive = GatewayDrive().engage().tick(50)
+    drive = engaged().tick(50)
     if mode is Mode.COMFORT_STOP:
         drive.ask(Operation.STOP)
     else:
@@ -663,7 +685,7 @@ def test_a_stop_without_a_plan_holds_the_wheel():
 
 
 def test_an_old_stop_has_no_say_in_what_comes_after_it():
-    drive = GatewayDrive().engage()
+    drive = engaged()
     drive.ask(Operation.STOP)
     drive.tick(100)
     drive.car.override = 1
@@ -680,8 +702,8 @@ def test_an_old_stop_has_no_say_in_what_comes_after_it():
 
 @pytest.mark.req("S2")
 def test_the_controller_may_be_another_one_after_an_engagement_and_not_after_a_mere_disarming():
-    for prepare, is_new in ((GatewayDrive.engage, True), (GatewayDrive.arm, False)):
-        drive = prepare(GatewayDrive())
+    for prepare, is_new in ((engaged, True), (armed, False)):
+        drive = prepare()
         drive.ask(Operation.DISENGAGE)
         drive.tick()
         assert drive.core.mode is Mode.STANDBY
@@ -690,7 +712,7 @@ def test_the_controller_may_be_another_one_after_an_engagement_and_not_after_a_m
 
 def test_speed_is_that_of_the_wheels_or_of_navigation_whoever_says_more():
     for vx_mps, wheels_mps in ((0.0, -3.0), (-3.0, 0.0)):
-        drive = GatewayDrive().engage()
+        drive = engaged()
         drive.ask(Operation.STOP)
         drive.tick()
         drive.car.vx_mps, drive.car.wheel_speed_offset_mps = vx_mps, wheels_mps - vx_mps
@@ -701,7 +723,7 @@ def test_speed_is_that_of_the_wheels_or_of_navigation_whoever_says_more():
 
 
 def test_heartbeat_every_100_ms():
-    drive = GatewayDrive().arm()
+    drive = armed()
     heartbeat_id = drive.catalogue.by_name["GW_Heartbeat"].arbitration_id
     beats = [any(f.arbitration_id == heartbeat_id for f in drive.tick().output.frames) for _ in range(100)]
     assert sum(beats) == 10

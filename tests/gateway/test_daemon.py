@@ -140,12 +140,12 @@ def test_a_control_loop_that_hangs_starves_the_watchdog_of_the_process(hub, rig)
         "import sys, time\n"
         "from gateway.cycle import ControlCycle\n"
         "from xil.cli import main\n"
-        "step = ControlCycle.step\n"
+        "look = ControlCycle.look\n"
         "def hang_at_last(cycle, *arguments):\n"
-        "    step(cycle, *arguments)\n"
+        "    look(cycle, *arguments)\n"
         "    if cycle._core.ticks == 50:\n"
         "        time.sleep(3600)\n"
-        "ControlCycle.step = hang_at_last\n"
+        "ControlCycle.look = hang_at_last\n"
         "main()\n"
     )
     rig.start(sys.executable, "-c", hang)
@@ -166,7 +166,7 @@ def test_a_control_loop_that_hangs_starves_the_watchdog_of_the_process(hub, rig)
 @pytest.mark.parametrize(
     ("changes", "exit_code", "said"),
     [
-        ({"profile": "fast", "more": "b = 2"}, 2, ["profile = 'fast': allowed: nominal, proving_ground, bench", "b: unknown key"]),
+        ({"profile": "fast", "more": "b = 2"}, 2, ["profile = 'fast': allowed: nominal, proving_ground, lifted, bench", "b: unknown key"]),
         ({"robots": "xilgate:nobody-serves-this"}, 3, ["robots: bus 'xilgate:nobody-serves-this'"]),
     ],
 )

@@ -13,6 +13,7 @@ from gateway.limits import (
     BENCH,
     COMFORT_STOP,
     EMERGENCY_STOP,
+    LIFTED,
     NOMINAL,
     PROFILES,
     PROVING_GROUND,
@@ -53,7 +54,7 @@ def test_the_grades_of_a_stop():
 
 
 def test_profiles_are_frozen_and_complete():
-    assert set(PROFILES.values()) == {NOMINAL, PROVING_GROUND, BENCH}
+    assert set(PROFILES.values()) == {NOMINAL, PROVING_GROUND, LIFTED, BENCH}
     with pytest.raises(dataclasses.FrozenInstanceError):
         NOMINAL.acceleration_mps2 = 9.0
 

@@ -101,6 +101,13 @@ def test_every_other_length_is_rejected(message):
 
 
 @pytest.mark.req("F5")
+@pytest.mark.parametrize(("raw", "is_valid"), [(0, False), (1, True), (2, None), (0xFC, None), (0xFF, None)])
+def test_a_yes_or_no_is_one_or_zero(raw, is_valid):
+    state = unpack(signed(Kind.VEHICLE_STATE, struct.pack("<QBB9d", 3, 1, raw, *[1.0] * 9)), KEY)
+    assert state is None if is_valid is None else state.is_valid is is_valid
+
+
+@pytest.mark.req("F5")
 @ONE_OF_EACH
 def test_another_version_or_magic_is_rejected_whoever_signed_it(message):
     kind = Kind.OPERATOR_REQUEST

@@ -567,5 +567,5 @@ def test_a_pedal_that_the_gateway_presses_is_no_foot_even_when_the_robot_denies_
         return [finding.cause for findings in found for finding in findings]
 
     assert cause not in until(1_000, 0, demand)
-    assert cause not in until(1_400, 1_000, Demand(0.0, 0.0, 0.0))  # asked for until 990 ms, 300 ms longer it counts, and 100 ms of patience
+    assert cause not in until(1_400, 1_000, Demand(0.0, 0.0, 0.0))  # 300 ms since it was asked for last, 100 ms of patience
     assert cause in until(1_410, 1_400, Demand(0.0, 0.0, 0.0))

@@ -70,7 +70,7 @@ def test_options_and_file_make_the_same_rig(rig_file, tmp_path):
 
 
 MISTAKES = {
-    'profile = "fast"': ("profile", "'fast'", "nominal, proving_ground, bench"),
+    'profile = "fast"': ("profile", "'fast'", "nominal, proving_ground, lifted, bench"),
     'name = ""': ("name", "''", "at least 1 character"),
     "speed = 3": ("speed", "unknown key"),
     'buses = { robots = "can0" }': ("buses.robots", "'can0'", "INTERFACE:CHANNEL"),

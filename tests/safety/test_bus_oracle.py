@@ -38,7 +38,8 @@ class Script:
     def car(self, name, values):
         message = WIRE.by_name[name]
         counter = self._counters[name] = self._counters.get(name, -1) + 1
-        self.oracle.observe(self.now_ns - 2 * MS, message.network, message.arbitration_id, message.compose(values, counter), is_from_gateway=False)
+        data = message.compose(values, counter)
+        self.oracle.observe(self.now_ns - 2 * MS, message.network, message.arbitration_id, data, is_from_gateway=False)
 
     def gateway(self, name, values):
         message = WIRE.by_name[name]
@@ -338,11 +339,12 @@ BROKEN = [
     ("crc", edited("SR_Command", _wrong_crc)), ("crc", edited("GW_SafetyCommand", _wrong_crc)),
     ("counter", edited("SR_Command", _other_counter(1))), ("counter", edited("SR_Command", _other_counter(-1))), ("counter", _lost_counter),
     ("message rate", _flood),
-    ("unasked", _unasked_arm), ("unasked", _refused_request_kept), ("unasked", _not_silent), ("authority", _one_step), ("authority", _again),
-    ("unasked", _after_restart), ("authority", _after_restart),
+    ("unasked", _unasked_arm), ("unasked", _refused_request_kept), ("unasked", _not_silent), ("unasked", _after_restart),
+    ("authority", _one_step), ("authority", _again), ("authority", _after_restart),
     ("not neutral", _enabled_while_armed), ("not neutral", _demand_while_armed("angle_deg")),
     ("not neutral", _demand_while_armed("drive_percent")), ("not neutral", _demand_while_armed("brake_percent")),
-    ("abandoned", _abandoned_stop), ("abandoned", _abandoned_drive), ("authority", _half_engaged), ("authority", engaged(request="Arm", is_enabled=False)),
+    ("abandoned", _abandoned_stop), ("abandoned", _abandoned_drive),
+    ("authority", _half_engaged), ("authority", engaged(request="Arm", is_enabled=False)),
     ("stale command", engaged(age_ms=101.0)), ("max speed", engaged(max_speed_kmh=200.0)), ("watchdog", engaged(answer=0)),
     ("measurement id", engaged(measurement_id=2)),
     ("steering angle", _ramp("angle_deg", 4.0, 120, speed_mps=0.0)), ("steering rate", _ramp("angle_deg", 8.2, 1, speed_mps=0.0)),
@@ -486,7 +488,8 @@ def test_the_limits_written_down_twice_are_the_same(name):
     angle_deg = min(math.degrees(profile.steering_wheel_limit_rad), 463.3)
     ours = (
         angle_deg, math.degrees(profile.steering_wheel_rate_radps), profile.lateral_acceleration_mps2, profile.lateral_jerk_mps3,
-        profile.acceleration_mps2, profile.deceleration_mps2, profile.drive_jerk_mps3, profile.brake_jerk_mps3, 3.6 * 1.1 * profile.max_speed_mps,
+        profile.acceleration_mps2, profile.deceleration_mps2, profile.drive_jerk_mps3, profile.brake_jerk_mps3,
+        3.6 * 1.1 * profile.max_speed_mps,
     )
     assert ours == pytest.approx(tuple(vars(envelope).values()), rel=0.01)
     assert set(ENVELOPES) == set(PROFILES)

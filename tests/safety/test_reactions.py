@@ -1,6 +1,7 @@
 """Every fault of the list at random phases in virtual time, judged by the bus oracle: the reaction in its time, and never a broken limit.
 
-100 phases of each row in an ordinary run, 1,000 of each way in the long lane. A failure names its seed; `python -m tests.support.trials 'F6 a message missing' 17` repeats one trial.
+100 phases of each row in an ordinary run, 1,000 of each way in the long lane. A failure names its seed;
+`python -m tests.support.trials 'F6 a message missing' 17` repeats one trial.
 """
 
 from unittest import mock
@@ -132,8 +133,8 @@ def test_steps_of_the_wall_clock_change_no_bit(step_s):
     for k, drive in enumerate(drives()):
         undisturbed = frames_of(drive.branch(k), 1_000 * MS)
         with (
-            mock.patch("time.time", lambda: 1.8e9 + step_s),
-            mock.patch("time.time_ns", lambda: round((1.8e9 + step_s) * 1e9)),
+            mock.patch("time.time", return_value=1.8e9 + step_s),
+            mock.patch("time.time_ns", return_value=round((1.8e9 + step_s) * 1e9)),
         ):
             assert frames_of(drive.branch(k), 1_000 * MS) == undisturbed
         assert len(undisturbed) > 400

@@ -1,7 +1,8 @@
 """A gateway in virtual time between a car that follows its robots, a controller, an operator and a bus oracle that judges it.
 
 Nothing here happens on the steps of the gateway alone: each message of the car, each command of the controller and each fault has a phase
-of its own, and the steps follow the commands as in the gateway's process. A world that drives can be copied, so that thousands of faults are tried from a handful of drives.
+of its own, and the steps follow the commands as in the gateway's process. A world that drives can be copied, so that thousands of faults
+are tried from a handful of drives.
 """
 
 import copy

@@ -7,8 +7,10 @@ how many ticks the gateway must have noticed, and which word its refusal has to 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 from dbc.health import BusState, LinkHealth
+from gateway.conditions import Surroundings
 from gateway.messages import CommandStatus, Mode, Operation, OperatorReply
 from tests.support.campaign import MS, World
 
@@ -96,12 +98,18 @@ CONDITIONS = {
     "SR_Status corrupt": Condition(member("corrupt", "SR_Status"), "SR_Status", Grade.SAFE, 9),
     "not armed": Condition(field("system_state", "Disarmed", None), "not armed", Grade.SAFE, 28, is_for_engage_only=True),
     "controller silent": Condition(of_controller("is_alive", False, True), "controller silent", Grade.SAFE, 18),
-    "controller degraded": Condition(of_controller("status", CommandStatus.DEGRADED, CommandStatus.OK), "good commands|degraded", sure_ticks=_COMMAND_TICKS),
+    "controller degraded": Condition(
+        of_controller("status", CommandStatus.DEGRADED, CommandStatus.OK), "good commands|degraded", sure_ticks=_COMMAND_TICKS
+    ),
     "controller failed": Condition(
         of_controller("status", CommandStatus.FAILED, CommandStatus.OK), "controller failed", Grade.SAFE, _COMMAND_TICKS
     ),
-    "beside the path": Condition(of_controller("lateral_error_m", 1.6, 0.0), "beside the path", sure_ticks=_COMMAND_TICKS, is_for_engage_only=True),
-    "off in heading": Condition(of_controller("heading_error_rad", -0.27, 0.0), "heading", sure_ticks=_COMMAND_TICKS, is_for_engage_only=True),
+    "beside the path": Condition(
+        of_controller("lateral_error_m", 1.6, 0.0), "beside the path", sure_ticks=_COMMAND_TICKS, is_for_engage_only=True
+    ),
+    "off in heading": Condition(
+        of_controller("heading_error_rad", -0.27, 0.0), "heading", sure_ticks=_COMMAND_TICKS, is_for_engage_only=True
+    ),
     "recorder": Condition(around(is_recording=False), "recorder"),
     "disk": Condition(around(disk_free_share=0.06), "disk"),
     "bus passive": Condition(around(health=LinkHealth(state=BusState.ERROR_PASSIVE)), "error-passive"),
@@ -237,7 +245,8 @@ class Rules:
         after, text = self.world.mode, " / ".join(reply.refusals)
         if not is_fresh and operation is not Operation.STOP and not reply.refusals:
             self._complain(f"a stale {operation.name} was granted")
-        if before is Mode.ENGAGED and after is Mode.ENGAGED and (operation is Operation.STOP or (operation is Operation.DISENGAGE and is_fresh)):
+        must_act = operation is Operation.STOP or (operation is Operation.DISENGAGE and is_fresh)
+        if must_act and before is Mode.ENGAGED and after is Mode.ENGAGED:
             self._complain(f"{operation.name} did not act: {text}")
         if not is_fresh:
             return
@@ -261,9 +270,10 @@ def surroundings_of(world: World) -> None:
     """Let `world.around` decide what the core is told of its surroundings."""
     plain = world.surroundings
 
-    def told(now_ns: int) -> object:
-        around = dict(world.around)
-        health = around.pop("health", None)
-        return replace(plain(now_ns), **around, **({"links": {"robots": health}} if health is not None else {}))
+    def told(now_ns: int) -> Surroundings:
+        around: dict[str, Any] = dict(world.around)
+        if (health := around.pop("health", None)) is not None:
+            around["links"] = {"robots": health}
+        return replace(plain(now_ns), **around)
 
-    world.surroundings = told  # type: ignore[assignment]
+    world.surroundings = told

@@ -5,16 +5,15 @@ An injection returns nothing: what it does lasts until the end of the trial. `Wo
 
 import math
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
 
 from dbc.frame import CanFrame
 from dbc.health import BusState, LinkHealth
 from gateway.conditions import Surroundings
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, VehicleState
 from tests.support.campaign import MS, TICK_NS, Frames, Tap, World, catalogue
-from tests.support.oracle_wire import Wire, WireMessage, counter_of
+from tests.support.taps import Edit, freeze, lose, randomly, rewrite, wire
 
 NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelLevel", "MilliTime")
 PROTECTED_MESSAGES = ("RC_SafetyStatus", "SR_Status", "AR_Status", "BR_Status")
@@ -22,100 +21,9 @@ NEEDED_MESSAGES = (*NAVIGATION_MESSAGES, *PROTECTED_MESSAGES, "CAR_WheelSpeeds",
 """Cyclic messages of 10 ms without which no drive goes on; NcomStatus00 has a timeout of 2 s of its own."""
 
 
-@cache
-def wire() -> Wire:
-    """The messages, as the oracle reads them."""
-    return Wire()
-
-
-def message_of(frame: CanFrame) -> WireMessage:
-    """The message that a frame of the car carries."""
-    name = catalogue().by_id[frame.arbitration_id].name
-    return wire().by_name[name]
-
-
 def random_time(world: World) -> int:
     """A time within the tick that comes next [ns]."""
     return world.now_ns + world.rng.randrange(1, TICK_NS)
-
-
-# ---- what buses and nodes do to frames
-
-
-def lose(names: Iterable[str]) -> Tap:
-    """These messages do not come."""
-    lost = {catalogue().by_name[name].arbitration_id for name in names}
-    return lambda t_ns, frame, rng: [] if frame.arbitration_id in lost else [(t_ns, frame)]
-
-
-def rewrite(name: str, edit: Callable[[WireMessage, bytes], bytes]) -> Tap:
-    """The payload of one message becomes what `edit` makes of it."""
-    message = wire().by_name[name]
-
-    def tap(t_ns: int, frame: CanFrame, rng: random.Random) -> Frames:
-        if frame.arbitration_id == message.arbitration_id:
-            frame = frame._replace(data=edit(message, frame.data))
-        return [(t_ns, frame)]
-
-    return tap
-
-
-def shift(name: str, signal: str, by: float) -> Tap:
-    """A signal is off by a constant; the node that sends it does not know and protects it as ever."""
-
-    def edit(message: WireMessage, data: bytes) -> bytes:
-        changed = message.changed(data, {signal: message.value(data, signal) + by})
-        return message.sealed(changed, counter_of(data))
-
-    return rewrite(name, edit)
-
-
-def freeze(name: str) -> Tap:
-    """A node repeats its last content with a counter that goes on."""
-    frozen: list[bytes] = []
-
-    def edit(message: WireMessage, data: bytes) -> bytes:
-        frozen.append(data)
-        return message.sealed(frozen[0], counter_of(data))
-
-    return rewrite(name, edit)
-
-
-def randomly(share: float, name: str | None, act: Callable[[int, CanFrame, random.Random], Frames]) -> Tap:
-    """A share of the frames, of one message or of all, meets something."""
-    identifier = None if name is None else catalogue().by_name[name].arbitration_id
-
-    def tap(t_ns: int, frame: CanFrame, rng: random.Random) -> Frames:
-        is_meant = identifier in (None, frame.arbitration_id)
-        return act(t_ns, frame, rng) if is_meant and rng.random() < share else [(t_ns, frame)]
-
-    return tap
-
-
-def flipped(frame: CanFrame, rng: random.Random, bits: int = 1) -> CanFrame:
-    """The frame with some wrong bits."""
-    data = bytearray(frame.data)
-    for position in rng.sample(range(8 * len(data)), bits):
-        data[position // 8] ^= 1 << position % 8
-    return frame._replace(data=bytes(data))
-
-
-def noisy(bit_error_rate: float) -> Tap:
-    """Bits are wrong at random, and the controller does not notice."""
-
-    def tap(t_ns: int, frame: CanFrame, rng: random.Random) -> Frames:
-        wrong = sum(rng.random() < bit_error_rate for _ in range(8 * len(frame.data)))
-        return [(t_ns, flipped(frame, rng, wrong) if wrong else frame)]
-
-    return tap
-
-
-def late(delay_ns: int) -> Tap:
-    """Everything comes later."""
-    return lambda t_ns, frame, rng: [(t_ns + delay_ns, frame)]
-
-
-# ---- the faults
 
 
 @dataclass(frozen=True)
@@ -265,23 +173,7 @@ def missing(*names: str) -> Callable[[World], None]:
     return inject
 
 
-def _wrong_crc(message: WireMessage, data: bytes) -> bytes:
-    return bytes([data[0] ^ 0x5A]) + data[1:]
-
-
-def _same_counter(message: WireMessage, data: bytes) -> bytes:
-    return message.sealed(data, 3)
-
-
-def _jumping_counter(message: WireMessage, data: bytes) -> bytes:
-    return message.sealed(data, 5 * counter_of(data))
-
-
-def _too_short(message: WireMessage, data: bytes) -> bytes:
-    return data[:-1]
-
-
-def bad_frames(edit: Callable[[WireMessage, bytes], bytes], names: tuple[str, ...], share: float = 1.0) -> Callable[[World], None]:
+def bad_frames(edit: Edit, names: tuple[str, ...], share: float = 1.0) -> Callable[[World], None]:
     """One of these messages goes bad, always or often."""
 
     def inject(world: World) -> None:
@@ -387,7 +279,8 @@ def strangers(per_tick: int) -> Callable[[World], None]:
         at_ns = random_time(world)
 
         def flood(t_ns: int, frame: CanFrame, rng: random.Random) -> Frames:
-            return [*((t_ns, CanFrame(rng.randrange(0x40), rng.randbytes(rng.randrange(9)), t_ns)) for _ in range(per_tick // 13)), (t_ns, frame)]
+            unknown = [CanFrame(rng.randrange(0x40), rng.randbytes(rng.randrange(9)), t_ns) for _ in range(per_tick // 13)]
+            return [*((t_ns, stranger) for stranger in unknown), (t_ns, frame)]
 
         world.taps.append((at_ns, flood))
         world.mark(at_ns, "F11 idle")

@@ -79,6 +79,7 @@ ENVELOPES = {
         max_speed_kmh=33.5,  # 30 km/h, and 10 %
     ),
 }
+ENVELOPES["lifted"] = ENVELOPES["proving_ground"]  # the virtual car drives there
 
 SAFE_STOP_MPS2, SAFE_STOP_JERK_MPS3 = 2.5, 1.5  # B3, F1
 COMFORT_STOP_MPS2, COMFORT_STOP_JERK_MPS3 = 1.0, 0.3  # decision on issue 5: Autoware's comfortable stop
@@ -143,6 +144,7 @@ REACTIONS = {
     "F14": Reaction(Kind.NONE, 0, "B3 F14: no effect"),
     "F15": Reaction(Kind.NONE, 0, "B3 F15: control unchanged"),
     "F17": Reaction(Kind.STOP, 150 * MS, "B3 F17: as F1"),
-    "second sender": Reaction(Kind.SILENCE, 10 * MS, "issue, Gate: a second sender of our own identifiers is detected; in the tick of its frame"),
+    "F17 telemetry": Reaction(Kind.NONE, 0, "B3 F17: what the gateway does not obey may be lost or flooded"),
+    "second sender": Reaction(Kind.SILENCE, 10 * MS, "issue, Gate: a second sender of our own identifiers is detected; in the same tick"),
     "E3": Reaction(Kind.RELEASE, 10 * MS, "B3 E3: the driver ends ENGAGED in the same tick", 50 * MS),
 }

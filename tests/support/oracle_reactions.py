@@ -31,6 +31,7 @@ class _Pending:
     marked_ns: int
     kind: Kind
     deadline_ns: int
+    is_about_first_frame: bool
 
     @property
     def allowed_ms(self) -> float:
@@ -60,7 +61,8 @@ class Stopwatch:
         reaction = REACTIONS[fault]
         if authority == "Engage" or (authority == "Stop" and reaction.kind in (Kind.RELEASE, Kind.SILENCE)):
             within_ns = reaction.within_ns if self._is_virtual else reaction.within_process_ns or reaction.within_ns
-            self._pending.append(_Pending(fault, t_ns, reaction.kind, max(t_ns + within_ns + self._jitter_ns, self._gap_until_ns)))
+            deadline_ns = max(t_ns + within_ns + self._jitter_ns, self._gap_until_ns)
+            self._pending.append(_Pending(fault, t_ns, reaction.kind, deadline_ns, is_about_first_frame=within_ns == 0))
 
     def gap(self, t_ns: int, until_ns: int) -> None:
         """The gateway's process is stopped from `t_ns` to `until_ns`: what is due in this time is due at its first frame after it."""
@@ -89,7 +91,9 @@ class Stopwatch:
             if authority == "Engage":
                 return False
             self._violate(t_ns, "false reaction", f"{pending.fault}: {authority} after {latency_ns / MS:.1f} ms")
-        elif t_ns > pending.deadline_ns:
+        elif pending.is_about_first_frame and is_safe:
+            self.answers.append(Answer(pending.fault, latency_ns))
+        elif t_ns > pending.deadline_ns or (pending.is_about_first_frame and latency_ns >= 0):
             what = f"first safe frame only after {latency_ns / MS:.1f} ms" if is_safe else f"{authority} after {latency_ns / MS:.1f} ms"
             self._violate(t_ns, "reaction", f"{pending.fault}: {what}, allowed {pending.allowed_ms:.0f} ms")
         elif is_safe:
@@ -102,6 +106,6 @@ class Stopwatch:
         """Time passes: silence is an answer too."""
         if not self._pending or t_ns - self.commanded_ns <= SILENT_NS:
             return
-        for pending in [p for p in self._pending if p.kind in _UNSAFE and t_ns > p.deadline_ns]:
+        for pending in [p for p in self._pending if p.kind in _UNSAFE and not p.is_about_first_frame and t_ns > p.deadline_ns]:
             self._pending.remove(pending)
             self.answers.append(Answer(pending.fault, max(0, self.commanded_ns + _TICK_NS - pending.marked_ns)))

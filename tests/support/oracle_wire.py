@@ -119,8 +119,9 @@ class WireMessage:
         for signal, value in values.items():
             field = self.fields[signal]
             if isinstance(value, str):
-                value = next(raw for raw, name in self.choices[signal].items() if name == value)
-            raw = round((value - field.offset) / field.scale)
+                raw = next(raw for raw, name in self.choices[signal].items() if name == value)
+            else:
+                raw = round((value - field.offset) / field.scale)
             for k, (byte, bit) in enumerate(reversed(field.bits)):
                 content[byte] = content[byte] & ~(1 << bit) | (raw >> k & 1) << bit
         return bytes(content)
@@ -174,7 +175,9 @@ def _read(message: Any, network: str) -> WireMessage:
         for signal in message.signals
     }
     fields = {
-        signal.name: Field(bit_positions(signal.start, signal.length, is_motorola=signal.byte_order == "big_endian"), signal.scale, signal.offset)
+        signal.name: Field(
+            bit_positions(signal.start, signal.length, is_motorola=signal.byte_order == "big_endian"), signal.scale, signal.offset
+        )
         for signal in message.signals
     }
     choices = {

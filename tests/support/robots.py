@@ -81,6 +81,10 @@ class StubCar:
     def is_engaged(self) -> bool:
         return self._state == "Engaged"
 
+    def let_go(self) -> None:
+        """The robots miss their commands."""
+        self._state = "Disarmed"
+
     def speak(self, now_ns: int) -> list[CanFrame]:
         """The frames of one cycle of 10 ms."""
         self._move(TICK_NS * 1e-9)
