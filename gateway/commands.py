@@ -48,6 +48,12 @@ class CommandGate:
         self._last: ControlCommand | None = None
         self._admitted_ns: int | None = None
 
+    def release(self) -> None:
+        """Let another sender come; what is known of the last one stays, but its good commands do not count for the next."""
+        self._last = None
+        self.strangers = 0
+        self.good_in_a_row = 0
+
     def offer(self, now_ns: int, command: ControlCommand, state_seq: int) -> bool:
         """Take a command in, or count why not.
 

@@ -13,7 +13,7 @@ from dbc.vehicle import Vehicle
 from gateway.actuation import Actuation
 from gateway.causes import Cause, Disengagement, Finding
 from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, RobotLimits
-from gateway.commands import MAX_STATE_LAG, NEVER_NS, CommandGate
+from gateway.commands import MAX_STATE_LAG, CommandGate
 from gateway.conditions import (
     COMMAND_TIMEOUT_NS,
     UNDISTURBED,
@@ -180,8 +180,8 @@ class GatewayCore:
             self.latency.echoed(m.measurement_id, now_ns)
 
     def _admit(self, now_ns: int, command: ControlCommand | None) -> None:
-        if self.mode in QUIET and COMMAND_TIMEOUT_NS < self.commands.age_ns(now_ns) < NEVER_NS:
-            self.commands.reset()  # a controller that has gone may come back as another process
+        if self.mode in QUIET and self.commands.age_ns(now_ns) > COMMAND_TIMEOUT_NS:
+            self.commands.release()  # a controller that has gone may come back as another process
         if command is not None and self.commands.offer(now_ns, command, self._state_seq):
             self._measurement_id = self.latency.answered(self._state_times_ns[command.state_seq % _REMEMBERED_STATES])
 

@@ -111,8 +111,8 @@ def _spoil_bytes(content: bytes, rng: random.Random) -> bytes:
     return content[:start] + new + content[start + length :] if rng.random() < 0.9 else content[:start]
 
 
-def _file(read: Callable[[Path], object], suffix: str) -> Callable[[bytes], None]:
-    """A parser of files; its mistakes are for people, who want no traceback and the name of the file."""
+def _file(read: Callable[[Path], object], suffix: str, *others: Path) -> Callable[[bytes], None]:
+    """A parser of files; its mistakes are for people, who want no traceback and the name of the file, or of one of the others."""
     path = Path(tempfile.mkdtemp()) / f"fuzzed{suffix}"
 
     def parse(content: bytes) -> None:
@@ -120,7 +120,7 @@ def _file(read: Callable[[Path], object], suffix: str) -> Callable[[bytes], None
         try:
             read(path)
         except UserMistake as error:
-            if not all("fuzzed" in line for line in str(error).split("\n")):
+            if not all(any(file.name in line for file in (path, *others)) for line in str(error).split("\n")):
                 raise ValueError(f"a mistake that does not name its file: {error}") from error
 
     return parse
@@ -207,7 +207,7 @@ def parsers() -> Mapping[str, Parser]:
         "scenario": Parser(
             _file(lambda path: load_scenario(str(path)), ".toml"), _contents(*sorted(SCENARIO_FOLDER.glob("*.toml"))), is_text=True
         ),
-        "mapping": Parser(_file(lambda path: load(SITE_FILES, path), ".toml"), _contents(SITE_MAPPING), is_text=True),
+        "mapping": Parser(_file(lambda path: load(SITE_FILES, path), ".toml", *SITE_FILES), _contents(SITE_MAPPING), is_text=True),
         "dbc": Parser(_file(_read_dbc, ".dbc"), _contents(ROBOTS_DBC, GNSS_IMU_DBC, SITE_DBC), is_text=True),
     }
 

@@ -331,6 +331,8 @@ def test_a_controller_may_come_back_as_another_process_while_nothing_is_armed(ar
     drive.tick(30)
     assert drive.core.mode is (Mode.STANDBY if arms else Mode.SILENT)
     drive.is_controller_alive, drive.command_boot_id = True, 8
+    drive.tick(4)
+    assert drive.core.commands.good_in_a_row == 1
     drive.engage()
 
 

@@ -14,7 +14,7 @@ from xil.cli import main
 calls: set[str] = set()
 events: set[str] = set()
 ticking = threading.local()
-step_of_the_gateway = ControlCycle.step
+look_of_the_gateway = ControlCycle.look
 
 
 def note_call(frame, event, called):
@@ -29,11 +29,11 @@ def note_event(event, _):
         events.add(event)
 
 
-def step(cycle, *arguments):
+def look(cycle, *arguments):
     ticking.is_on = True
     sys.setprofile(note_call)
     try:
-        step_of_the_gateway(cycle, *arguments)
+        look_of_the_gateway(cycle, *arguments)
     finally:
         sys.setprofile(None)
         ticking.is_on = False
@@ -41,7 +41,7 @@ def step(cycle, *arguments):
 
 if __name__ == "__main__":
     report = Path(sys.argv.pop(1))
-    ControlCycle.step = step
+    ControlCycle.look = look
     sys.addaudithook(note_event)
     try:
         main()

@@ -4,7 +4,7 @@
 
 Standard input changes it, one JSON object a line: `steer_rad`, `drive_norm`, `status`, `skip` (commands that it does not send),
 `bad` (what is wrong with its commands, of `BAD`; null for nothing). The answer {"since_ns": ...} is the time at which the first such
-command is sent, or not sent. It says {"mode": ...} when the states tell another one.
+command is sent, or not sent. It says {"mode": ..., "t_ns": ...} when the states tell another one.
 """
 
 import random
@@ -64,7 +64,7 @@ class ControllerProcess:
             return
         if state.mode.name != self._mode:
             self._mode = state.mode.name
-            say(mode=self._mode)
+            say(mode=self._mode, t_ns=now_ns)
         self._seq += 1
         if self._settings["skip"]:
             self._settings["skip"] -= 1

@@ -152,7 +152,7 @@ class Rules:
         else:
             del self.bad[name]
         if name == SILENT:
-            self.bad |= {told: self._tick for told in TOLD_BY_CONTROLLER if told in self.bad}
+            self.bad |= dict.fromkeys(set(TOLD_BY_CONTROLLER) & set(self.bad), self._tick)
 
     def restart(self) -> None:
         """The gateway's process begins anew and has to learn that all is good."""
@@ -184,7 +184,9 @@ class Rules:
         if world.mode is not before and world.mode is Mode.READY:
             self._ready_since = self._tick
         if world.mode is not before and world.mode is Mode.STANDBY:
-            self._good_since = self._tick  # the controller is a new one, which has to show 25 good commands
+            # The controller is a new one: it has to show 25 good commands, and what it says is not known yet.
+            self._good_since = self._tick
+            self.bad |= dict.fromkeys(set(TOLD_BY_CONTROLLER) & set(self.bad), self._tick)
         self.complaints += [f"oracle: {violation}" for violation in world.oracle.finish(world.now_ns)]
         world.oracle.violations.clear()
 

@@ -33,6 +33,7 @@ class Way:
         req: its id.
         key: of the reaction that the oracle awaits.
         inject: begins it; the time at which it is there [ns].
+        mode: that the gateway then tells the controller; empty where one of the two is gone.
         undo: ends it; the gateway may be in any mode.
         lasts_s: how long one is watched to which no reaction is due [s].
     """
@@ -40,6 +41,7 @@ class Way:
     req: str
     name: str
     key: str
+    mode: str
     inject: Callable[[ProcessBench, random.Random], int]
     undo: Callable[[ProcessBench], object] = lambda bench: None
     lasts_s: float = 0.5
@@ -90,28 +92,52 @@ def _conclusive(bench: ProcessBench, way: Way, dice: random.Random) -> Outcome:
 def _try(bench: ProcessBench, way: Way, dice: random.Random) -> tuple[Outcome, str]:
     bench.engage()
     time.sleep(dice.uniform(0.0, PHASE_S))
-    begin, latency_ms, failures = len(bench.oracle.said), None, []
+    begin = len(bench.oracle.said)
     with Quiet() as quiet:
-        bench.oracle.tell(fault=way.key, t_ns=way.inject(bench, dice))
-        if REACTIONS[way.key].kind is Kind.NONE:
-            time.sleep(way.lasts_s)
-            bench.oracle.tell(end=way.key)
-            failures += [] if bench.mode == "ENGAGED" else [f"mode {bench.mode}"]
-            time.sleep(HELD_BACK_S)
-        else:
-            latency_ms = bench.reaction_ms(way.key, begin, ANSWER_S)
-            failures += [] if latency_ms is not None else ["no reaction in its time"]
+        is_to_go_on = REACTIONS[way.key].kind is Kind.NONE
+        latency_ms, failures = (_goes_on if is_to_go_on else _reacts)(bench, way, dice)
     way.undo(bench)
     bench.release()
     time.sleep(HELD_BACK_S)
     return Outcome(latency_ms, (*failures, *bench.violations(begin))), quiet.disturbance
 
 
+def _goes_on(bench: ProcessBench, way: Way, dice: random.Random) -> tuple[None, list[str]]:
+    bench.oracle.tell(fault=way.key, t_ns=way.inject(bench, dice))
+    time.sleep(way.lasts_s)
+    bench.oracle.tell(end=way.key)
+    failures = [] if bench.mode == way.mode else [f"mode {bench.mode}"]
+    time.sleep(HELD_BACK_S)
+    return None, failures
+
+
+def _reacts(bench: ProcessBench, way: Way, dice: random.Random) -> tuple[float | None, list[str]]:
+    begin, said_begin = len(bench.oracle.said), len(bench.controller.said)
+    begin_ns = way.inject(bench, dice)
+    bench.oracle.tell(fault=way.key, t_ns=begin_ns)
+    latency_ms = bench.reaction_ms(way.key, begin, ANSWER_S)
+    if latency_ms is None:
+        return None, ["no reaction in its time"]
+    if not way.mode:
+        return latency_ms, []
+    told = bench.controller.look_for(lambda line: line.get("mode") == way.mode, said_begin, ANSWER_S)
+    if told is None:
+        return latency_ms, [f"mode {bench.mode}"]
+    if way.mode == "FAULT":  # the bus cannot tell whether the gateway or the fault has silenced it
+        latency_ms = (told["t_ns"] - begin_ns) / MS
+    return latency_ms, [] if latency_ms <= way.within_ms else [f"FAULT only after {latency_ms:.0f} ms"]
+
+
 # ---- the faults
 
 
-def _controller_killed(bench: ProcessBench, dice: random.Random) -> int:
-    return bench.controller.signal(signal.SIGKILL)
+Inject = Callable[[ProcessBench, random.Random], int]
+
+
+def _controller_signalled(number: signal.Signals) -> Inject:
+    return lambda bench, dice: bench.controller.signal(number)
+
+
 
 
 def _another_controller(bench: ProcessBench) -> None:
@@ -119,7 +145,7 @@ def _another_controller(bench: ProcessBench) -> None:
     bench.start_controller()
 
 
-def _controller_told(**what: object) -> Callable[[ProcessBench, random.Random], int]:
+def _controller_told(**what: object) -> Inject:
     return lambda bench, dice: bench.controller.ask(**what)
 
 
@@ -144,7 +170,7 @@ def _overridden(bench: ProcessBench, dice: random.Random) -> int:
     return bench.car.ask(override=1) if node is None else bench.car.ask(override_of=[node])
 
 
-def _car_told(**what: object) -> Callable[[ProcessBench, random.Random], int]:
+def _car_told(**what: object) -> Inject:
     return lambda bench, dice: bench.car.ask(**what)
 
 
@@ -174,7 +200,7 @@ def _quiet_again(bench: ProcessBench) -> None:
     _babbler(bench).ask(rate_hz=0)
 
 
-def _gateway_told(number: signal.Signals) -> Callable[[ProcessBench, random.Random], int]:
+def _gateway_signalled(number: signal.Signals) -> Inject:
     return lambda bench, dice: bench.signal_gateway(number)
 
 
@@ -184,7 +210,7 @@ def _gateway_sleeps(bench: ProcessBench, dice: random.Random) -> int:
     return bench.signal_gateway(signal.SIGCONT)
 
 
-def _flood(kind: str) -> Callable[[ProcessBench, random.Random], int]:
+def _flood(kind: str) -> Inject:
     def inject(bench: ProcessBench, dice: random.Random) -> int:
         return bench.helper("flood_process", str(bench.base_port), str(bench.directory)).ask(kind=kind)
 
@@ -196,25 +222,25 @@ def _no_flood(bench: ProcessBench) -> None:
 
 
 WAYS = (
-    Way("F1", "controller killed", "F1", _controller_killed, _another_controller),
-    Way("F2", "controller stopped", "F2", lambda b, d: b.controller.signal(signal.SIGSTOP), lambda b: b.controller.signal(signal.SIGCONT)),
-    Way("F3", "one solve missed", "F3", _controller_told(skip=1)),
-    Way("F4", "solver fails", "F4", _controller_told(status="FAILED"), lambda b: b.controller.ask(status="OK")),
-    Way("F5", "bad commands", "F17", _bad_commands, lambda b: b.controller.ask(bad=None)),
-    Way("F6", "a message missing", "F6", _missing, _car_heals(silent=[])),
-    Way("F7", "wrong CRC", "F7", _corrupt, _car_heals(corrupt=[])),
-    Way("F8", "speeds differ", "F8", _speed_off, _car_heals(wheel_speed_offset_mps=0.0)),
-    Way("F8", "navigation frozen", "F8", _car_told(is_time_frozen=True), _car_heals(is_time_frozen=False)),
-    Way("F9", "1 % lost", "F9 mild", _car_told(lose_norm=0.01), _car_heals(lose_norm=0.0), 2.0),
-    Way("F9", "20 % lost", "F9", _car_told(lose_norm=0.2), _car_heals(lose_norm=0.0)),
-    Way("F9", "120 ms late", "F9", _car_told(late_ms=120), _car_heals(late_ms=0)),
-    Way("F10", "bus-off", "F10", _bus_off, ProcessBench.restart_gateway),
-    Way("F11", "babbling idiot", "F11", _babbling, _quiet_again),
-    Way("F11", "unknown identifiers", "F11 idle", _strangers, _quiet_again),
-    Way("F12", "gateway killed", "F12", _gateway_told(signal.SIGKILL), ProcessBench.restart_gateway),
-    Way("F12", "gateway stopped", "F12", _gateway_told(signal.SIGSTOP), ProcessBench.restart_gateway),
-    Way("F13", "gateway sleeps for 500 ms", "F13", _gateway_sleeps),
-    Way("F17", "telemetry flooded", "F17 telemetry", _flood("telemetry"), _no_flood, 1.0),
-    Way("F17", "junk on the control sockets", "F17 telemetry", _flood("sockets"), _no_flood, 1.0),
-    Way("E3", "driver overrides", "E3", _overridden, _car_heals(override=0, override_of=[])),
+    Way("F1", "controller killed", "F1", "", _controller_signalled(signal.SIGKILL), _another_controller),
+    Way("F2", "controller stopped", "F2", "", _controller_signalled(signal.SIGSTOP), lambda bench: bench.controller.signal(signal.SIGCONT)),
+    Way("F3", "one solve missed", "F3", "ENGAGED", _controller_told(skip=1)),
+    Way("F4", "solver fails", "F4", "SAFE_STOP", _controller_told(status="FAILED"), lambda bench: bench.controller.ask(status="OK")),
+    Way("F5", "bad commands", "F17", "SAFE_STOP", _bad_commands, lambda bench: bench.controller.ask(bad=None)),
+    Way("F6", "a message missing", "F6", "SAFE_STOP", _missing, _car_heals(silent=[])),
+    Way("F7", "wrong CRC", "F7", "SAFE_STOP", _corrupt, _car_heals(corrupt=[])),
+    Way("F8", "speeds differ", "F8", "SAFE_STOP", _speed_off, _car_heals(wheel_speed_offset_mps=0.0)),
+    Way("F8", "navigation frozen", "F8", "SAFE_STOP", _car_told(is_time_frozen=True), _car_heals(is_time_frozen=False)),
+    Way("F9", "1 % lost", "F9 mild", "ENGAGED", _car_told(lose_norm=0.01), _car_heals(lose_norm=0.0), 2.0),
+    Way("F9", "20 % lost", "F9", "SAFE_STOP", _car_told(lose_norm=0.2), _car_heals(lose_norm=0.0)),
+    Way("F9", "120 ms late", "F9", "SAFE_STOP", _car_told(late_ms=120), _car_heals(late_ms=0)),
+    Way("F10", "bus-off", "F10", "FAULT", _bus_off, ProcessBench.restart_gateway),
+    Way("F11", "babbling idiot", "F11", "FAULT", _babbling, _quiet_again),
+    Way("F11", "unknown identifiers", "F11 idle", "ENGAGED", _strangers, _quiet_again),
+    Way("F12", "gateway killed", "F12", "", _gateway_signalled(signal.SIGKILL), ProcessBench.restart_gateway),
+    Way("F12", "gateway stopped", "F12", "", _gateway_signalled(signal.SIGSTOP), ProcessBench.restart_gateway),
+    Way("F13", "gateway sleeps for 500 ms", "F13", "SAFE_STOP", _gateway_sleeps),
+    Way("F17", "telemetry flooded", "F17 telemetry", "ENGAGED", _flood("telemetry"), _no_flood, 1.0),
+    Way("F17", "junk on the control sockets", "F17 telemetry", "ENGAGED", _flood("sockets"), _no_flood, 1.0),
+    Way("E3", "driver overrides", "E3", "STANDBY", _overridden, _car_heals(override=0, override_of=[])),
 )
