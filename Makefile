@@ -5,8 +5,9 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 INSTALL := $(PIP) install --require-hashes --only-binary :all:
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
+comma := ,
 
-.PHONY: setup run test test-long test-socketcan lint bench clean lock install-target
+.PHONY: setup run test test-long test-socketcan coverage mutation lint bench clean lock install-target
 
 setup: $(VENV)/project.stamp
 	@set -- $$CC; for compiler in $$1 cc gcc clang; do \
@@ -28,6 +29,18 @@ test-long: setup $(VENV)/dev.stamp
 test-socketcan: setup $(VENV)/dev.stamp
 	@if ip link show vcan0 up >/dev/null 2>&1; then run=; else run=tests/support/vcan_guest.sh; fi; \
 	$$run $(BIN)/python -m pytest -p no:cacheprovider tests/dbc/test_link.py tests/socketcan
+
+# What decides about a car, by the tests of it alone; both lists are those of [tool.mutmut].
+MUTMUT = $(shell $(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["tool"]["mutmut"]["$(1)"], sep="$(2)")')
+coverage: setup $(VENV)/dev.stamp
+	$(BIN)/coverage run --include=$(call MUTMUT,only_mutate,$(comma)) -m pytest $(call MUTMUT,pytest_add_cli_args_test_selection, )
+	$(BIN)/coverage report
+
+# Takes about ten minutes. mutmut keeps what has not changed in mutants/, but does not see all that has.
+mutation: setup $(VENV)/dev.stamp
+	rm -rf mutants
+	PATH="$(CURDIR)/$(BIN):$$PATH" mutmut run
+	$(BIN)/python -m tests.support.survivors
 
 lint: setup $(VENV)/dev.stamp
 	$(BIN)/ruff check .
@@ -61,7 +74,7 @@ install-target:
 	@echo "installed in $(TARGET); what is left to do: $(PREFIX)/share/doc/target.md"
 
 clean:
-	rm -rf $(VENV) build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist mutants .coverage .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 # The lock files, brought up to pyproject.toml; needs uv. What builds the project is locked with what runs it.

@@ -16,6 +16,7 @@ from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, 
 from gateway.commands import MAX_STATE_LAG, CommandGate
 from gateway.conditions import (
     COMMAND_TIMEOUT_NS,
+    MAX_REQUEST_AHEAD_NS,
     UNDISTURBED,
     Situation,
     Surroundings,
@@ -231,7 +232,7 @@ class GatewayCore:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
         if refused := untimely(request, situation.now_ns, last_ns):
             return [refused]
-        self._last_request_ns = max(min(request.t_ns, situation.now_ns), last_ns)  # a STOP may be of any time
+        self._last_request_ns = max(min(request.t_ns, situation.now_ns + MAX_REQUEST_AHEAD_NS), last_ns)  # a STOP may be of any time
         trigger = _TRIGGER_OF_OPERATION.get(request.operation) or REACTIONS[_CAUSE_OF_OPERATION[request.operation]]
         if (self.mode, trigger) not in TRANSITIONS:
             return [f"not possible in {self.mode.name}"]
@@ -270,10 +271,13 @@ class GatewayCore:
             self.actuation.follow(command.plan_steer_rad[k], command.plan_drive_norm[k], m.vx_mps, m.brake_norm)
         elif self.mode in (Mode.COMFORT_STOP, Mode.SAFE_STOP) and self._safe_stop is not None:
             stop = self._safe_stop.demand(now_ns, self._speed_mps)
+            steer_rad = stop.steer_rad
+            if self.mode is Mode.COMFORT_STOP and command is not None:  # it takes long, and the controller is well
+                steer_rad = command.plan_steer_rad[plan_index(command, now_ns)]
             if stop.is_standing:
                 self.actuation.hold_still()
             else:
-                self.actuation.decelerate(stop.steer_rad, stop.deceleration_mps2, m.vx_mps, m.brake_norm)
+                self.actuation.decelerate(steer_rad, stop.deceleration_mps2, m.vx_mps, m.brake_norm)
         else:
             self.actuation.release()
 

@@ -20,7 +20,7 @@ from tests.support.drive import GatewayDrive
 
 @cache
 def _prepared(mode):
-    return GatewayDrive().arm() if mode is Mode.READY else GatewayDrive().engage()
+    return {Mode.SILENT: GatewayDrive.tick, Mode.READY: GatewayDrive.arm, Mode.ENGAGED: GatewayDrive.engage}[mode](GatewayDrive())
 
 
 def _twin(drive):
@@ -425,6 +425,18 @@ def test_a_request_acts_once():
     assert drive.core.mode is Mode.READY
 
 
+@pytest.mark.req("S2")
+def test_a_request_that_was_made_while_a_step_was_under_way_acts_once():
+    drive = engaged()
+    drive.ask(Operation.STOP)
+    asked = drive._to_send = replace(drive._to_send, operation=Operation.DISENGAGE, t_ns=drive.now_ns + TICK_NS + 300_000)
+    drive.tick()
+    assert drive.output.reply.refusals == ()
+    drive._to_send = asked
+    drive.tick()
+    assert drive.output.reply.refusals == ("the request is repeated, or made before another one",)
+
+
 def test_a_stop_from_the_future_does_not_hold_up_what_is_asked_now():
     drive = armed()
     drive.ask(Operation.STOP)
@@ -549,6 +561,7 @@ def test_before_any_command_there_is_no_measurement():
     drive.ask(Operation.RESET)
     told = drive.tick().car.told["GW_SafetyCommand"]
     assert (drive.core.mode, told["MeasurementId"], told["CommandAge"]) == (Mode.STANDBY, 0, 255)
+    assert told["MaxSpeed"] == round(1.1 * drive.core.profile.max_speed_mps * 3.6)
 
 
 @pytest.mark.parametrize("lag", range(11))
@@ -632,6 +645,58 @@ def test_everything_has_to_be_good_for_a_second_without_a_break():
         (blocker,) = drive.tick().core.blockers
         assert blocker == f"everything good for {10_000_000 * (good_ms // 10) * 1e-9:.1f} s, 1.0 s needed"
     assert drive.tick().core.blockers == []
+
+
+@pytest.mark.req("F8")
+def test_a_robot_controller_that_asks_no_new_question_is_found_after_100_ms():
+    drive = engaged().tick(10)
+    drive.car.is_asking = False
+    asked_ns = drive.now_ns
+    drive.tick(20)
+    assert drive.transitions[-1].finding == Finding(Cause.WATCHDOG_SILENT, pytest.approx(110.0), 100.0, "RC")
+    assert drive.transitions[-1].t_ns == asked_ns + 110_000_000
+
+
+def test_a_clock_that_has_run_for_long_shortens_no_stop():
+    drive = GatewayDrive()
+    drive.now_ns = 10**15
+    drive.engage()
+    drive.ask(Operation.STOP)
+    drive.tick(2)
+    drive.ask(Operation.RESET)
+    drive.tick()
+    assert drive.output.reply.refusals == ("the car moves: 20.0 m/s",)
+
+
+@pytest.mark.req("S2")
+@pytest.mark.parametrize(("ticks", "is_gone"), [(9, False), (10, True)])
+def test_a_controller_has_gone_when_its_last_command_is_older_than_100_ms(ticks, is_gone):
+    drive = GatewayDrive()
+    drive.tick()  # with a command
+    drive.is_controller_alive = False
+    drive.tick(ticks)
+    other = replace(drive.command(), boot_id=8)
+    drive.core.step(drive.now_ns + TICK_NS, [], replace(other, t_ns=drive.now_ns + TICK_NS))
+    assert drive.core.commands.rejected == ({} if is_gone else {"second sender": 1})
+
+
+@pytest.mark.req("F5")
+def test_commands_that_were_never_good_are_told_as_invalid():
+    drive = GatewayDrive()
+    drive.steer_rad = 3.0
+    drive.tick(13)
+    assert Cause.COMMAND_INVALID in {finding.cause for finding in drive.core.findings}
+
+
+def test_after_an_engagement_the_wheel_follows_nothing_any_more():
+    drive = engaged().tick(50)
+    drive.ask(Operation.DISENGAGE)
+    drive.tick()
+    drive.car.steering_wheel_deg = 90.0
+    drive.tick(2)
+    drive.tick(200)
+    assert Cause.STEERING_NOT_FOLLOWING not in {finding.cause for finding in drive.core.findings}
+    assert drive.core.mode is Mode.STANDBY
 
 
 @pytest.mark.req("F13")
@@ -761,10 +826,26 @@ def test_no_demand_ever_breaks_a_limit(steers, drives, vx_mps):
 @given(data=st.data())
 @settings(max_examples=100, deadline=None)
 def test_no_frame_makes_the_core_raise(data):
-    drive = GatewayDrive().tick(3)
+    drive = _twin(_prepared(Mode.SILENT))
     now_ns = drive.now_ns + TICK_NS
     ids = st.one_of(st.sampled_from(sorted(drive.catalogue.by_id)), st.integers(0, 2047))
     frames = data.draw(st.lists(st.builds(CanFrame, ids, st.binary(max_size=8), st.just(now_ns)), max_size=40))
     output = drive.core.step(now_ns, frames)
     assert output.state.mode is Mode.SILENT
     assert drive.core.supervisor.received >= len(frames)
+
+
+def test_in_a_gentle_stop_the_controller_goes_on_steering():
+    drive = GatewayDrive()
+    drive.car.is_following = True
+    drive.engage().tick(20)
+    drive.ask(Operation.STOP)
+    drive.tick()
+    assert drive.core.mode is Mode.COMFORT_STOP
+    drive.steer_rad = 0.01
+    drive.tick(30)
+    assert drive.car.told["SR_Command"]["AngleCommand"] == pytest.approx(math.degrees(0.01 * 14.7), abs=0.06)
+    assert drive.car.told["BR_Command"]["PositionCommand"] > 0.0
+    drive.is_controller_alive = False
+    drive.tick(20)
+    assert drive.core.mode is Mode.SAFE_STOP

@@ -13,14 +13,17 @@ import time
 
 import can
 
+from dbc.realtime import take_priority
 from tests.support.lines import Told, say
 
+PRIORITY = 40
 ROOM_S = 0.005
 
 
 def main() -> None:
     """Live until standard input ends."""
     told, rate_hz, identifier, dice = Told(), 0.0, 0, random.Random(1)
+    take_priority(PRIORITY)
     with can.Bus(interface="xilgate", channel=sys.argv[1].partition(":")[2], receive_own_messages=False) as bus:
         say(running=True)
         while not told.is_over:

@@ -41,6 +41,7 @@ class Helper:
 
     Attributes:
         said: all that it has told, oldest first.
+        pid: of the process.
     """
 
     def __init__(self, module: str, *arguments: str) -> None:
@@ -49,6 +50,7 @@ class Helper:
         self._process = subprocess.Popen(
             [sys.executable, "-m", f"tests.support.{module}", *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
         )
+        self.pid = self._process.pid
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 

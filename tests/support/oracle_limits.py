@@ -127,7 +127,7 @@ REACTIONS = {
     "F1": Reaction(Kind.STOP, 120 * MS, "B3 F1: command age 100 ms, first safe frame 120 ms", 150 * MS),
     "F2": Reaction(Kind.STOP, 120 * MS, "B3 F2: same as F1", 150 * MS),
     "F3": Reaction(Kind.NONE, 0, "B3 F3: exactly one missed solve: no disengagement"),
-    "F4": Reaction(Kind.STOP, 10 * MS, "B3 F4: within one tick after the third degraded cycle, or a failed one"),
+    "F4": Reaction(Kind.STOP, 12 * MS, "B3 F4: within one tick (11.25 ms) after the third degraded cycle, or a failed one"),
     "F5": Reaction(Kind.STOP, 100 * MS, "B3 F5: in the tick of the third bad command in a row; from the first one, every 40 ms"),
     "F5 one": Reaction(Kind.NONE, 0, "B3 F5: a single bad command is dropped, never encoded"),
     "F6": Reaction(Kind.STOP, 70 * MS, "B3 F6: 3 periods and at least 30 ms, at most 50 ms; first safe frame 70 ms"),
@@ -146,5 +146,5 @@ REACTIONS = {
     "F17": Reaction(Kind.STOP, 150 * MS, "B3 F17: as F1"),
     "F17 telemetry": Reaction(Kind.NONE, 0, "B3 F17: what the gateway does not obey may be lost or flooded"),
     "second sender": Reaction(Kind.SILENCE, 10 * MS, "issue, Gate: a second sender of our own identifiers is detected; in the same tick"),
-    "E3": Reaction(Kind.RELEASE, 10 * MS, "B3 E3: the driver ends ENGAGED in the same tick", 50 * MS),
+    "E3": Reaction(Kind.RELEASE, 12 * MS, "B3 E3: the driver ends ENGAGED in the same tick (up to 11.25 ms)", 50 * MS),
 }

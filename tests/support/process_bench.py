@@ -1,4 +1,4 @@
-"""Real processes around a real gateway process: two emulated buses, stub car, stub controller, an operator, and the bus oracle that judges."""
+"""Real processes around a gateway process: two emulated buses, stub car, stub controller, an operator, and the bus oracle that judges."""
 
 import contextlib
 import os
@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
+from dbc.realtime import take_priority
 from dbc.vehicle import FOCUS
 from gateway.channel import ChannelError, control_path, operator_client
 from gateway.messages import Mode, Operation, OperatorReply
@@ -22,6 +23,7 @@ from vehicle_emulator.bus.interface import XilgateBus
 PROFILE = "nominal"
 SPEED_MPS = 12.0
 NETWORKS = ("robots", "navigation")
+ORACLE_PRIORITY = 5
 START_S = 30.0
 READY_S = 10.0
 SETTLED_S = 0.3
@@ -36,6 +38,7 @@ class ProcessBench:
         wrapper: command that starts the gateway's command, such as `unshare --mount`.
 
     Attributes:
+        opened: what ends with the bench.
         saboteur: a node on the robots' bus that can destroy frames.
         starts_s: time from each start of the gateway to its answering an operator [s].
     """
@@ -51,7 +54,7 @@ class ProcessBench:
         self._control = control_path(directory)
         self.starts_s: list[float] = []
         self._helpers: dict[str, Helper] = {}
-        self._opened = contextlib.ExitStack()
+        self.opened = contextlib.ExitStack()
         try:
             self._start()
         except BaseException:
@@ -61,25 +64,32 @@ class ProcessBench:
     def _start(self) -> None:
         self._write_rig()
         hub = start_xilgate("bus", *self.channels.values())
-        self._opened.callback(_end, hub)
+        self.opened.callback(ended, hub)
         wait_until(lambda: all(map(is_served, self.channels.values())), START_S, "the buses")
         self.saboteur = XilgateBus(self.channels["robots"])
-        self._opened.callback(self.saboteur.shutdown)
+        self.opened.callback(self.saboteur.shutdown)
         self._control.key()
-        arguments = [f"{network}={bus}" for network, bus in self.buses.items()]
-        self.car = self.start_helper("car_process", *arguments)
-        bus_options = [option for argument in arguments for option in ("--bus", argument)]
+        self.start_car()
+        bus_options = [option for network, bus in self.buses.items() for option in ("--bus", f"{network}={bus}")]
         self.oracle = self.start_helper("oracle_process", *bus_options, "--profile", PROFILE)
-        self._opened.callback(lambda: _end(self.gateway) if hasattr(self, "gateway") else None)
+        take_priority(ORACLE_PRIORITY, self.oracle.pid)  # it has to keep up, however loaded the machine is
         self.start_gateway()
         self.start_controller()
         self.oracle.wait_for(lambda line: "listening" in line)
+
+    def start_car(self) -> None:
+        """The stub car."""
+        self.car = self.start_helper("car_process", *(f"{network}={bus}" for network, bus in self.buses.items()))
         self.car.wait_for(lambda line: "running" in line)
+
+    def roll(self, speed_mps: float) -> None:
+        """The driver has let go of the car, which rolls."""
+        self.car.ask(vx_mps=speed_mps, override_of=[])
 
     def start_helper(self, module: str, *arguments: str) -> Helper:
         """A helper that ends with the bench."""
         helper = Helper(module, *arguments)
-        self._opened.callback(helper.close)
+        self.opened.callback(helper.close)
         return helper
 
     def helper(self, module: str, *arguments: str) -> Helper:
@@ -102,7 +112,7 @@ class ProcessBench:
 
     def close(self) -> None:
         """End everything."""
-        self._opened.close()
+        self.opened.close()
         self._log.close()
 
     # ---- processes
@@ -113,6 +123,7 @@ class ProcessBench:
         self.oracle.tell(restart=True)
         command = [*self._wrapper, sys.executable, "-m", "xil", "gateway", "--rig", str(self.directory / "rig.toml")]
         self.gateway = subprocess.Popen(command, stdout=self._log, stderr=self._log, start_new_session=True)
+        self.opened.callback(ended, self.gateway)
         wait_until(self._is_answering, START_S, f"the gateway; see {self._log.name}")
         self.starts_s.append(time.monotonic() - start_s)
 
@@ -164,7 +175,7 @@ class ProcessBench:
 
     def engage(self, speed_mps: float = SPEED_MPS) -> None:
         """Until the gateway drives the car, which then rolls at that speed."""
-        self.car.ask(vx_mps=speed_mps, override_of=[])
+        self.roll(speed_mps)
         for operation, mode in ((Operation.ARM, Mode.READY), (Operation.ENGAGE, Mode.ENGAGED)):
             deadline_s, reply = time.monotonic() + READY_S, None
             while reply is None or reply.mode is not mode:
@@ -200,13 +211,29 @@ class ProcessBench:
         line = self.oracle.look_for(is_it, begin, timeout_s)
         return float(line["latency_ms"]) if line is not None and "reaction" in line else None
 
-    def metrics(self) -> str:
-        """What the gateway tells Prometheus."""
+    def metrics(self) -> dict[str, float]:
+        """What the gateway tells Prometheus: value by name and labels."""
         with urllib.request.urlopen(f"http://127.0.0.1:{self.metrics_port}/metrics", timeout=10) as answer:
-            return str(answer.read().decode())
+            lines = [line for line in answer.read().decode().splitlines() if not line.startswith("#")]
+        return {name: float(value) for name, _, value in (line.rpartition(" ") for line in lines)}
+
+    def buckets(self, histogram: str) -> dict[float, float]:
+        """Counts of a histogram by upper bound [s], cumulated."""
+        prefix = f'xilgate_gateway_{histogram}_bucket{{le="'
+        return {float(name[len(prefix) : -2]): count for name, count in self.metrics().items() if name.startswith(prefix)}
+
+    def recorder_pid(self) -> int:
+        """The recorder, which is a child of the gateway."""
+        return int(Path(f"/proc/{self.gateway.pid}/task/{self.gateway.pid}/children").read_text(encoding="ascii").split()[0])
 
 
-def _end(process: subprocess.Popen[bytes] | subprocess.Popen[str]) -> None:
+def percentile_s(before: dict[float, float], after: dict[float, float], share: float) -> float:
+    """Upper bound of the bucket in which a percentile of what was counted in between lies [s]."""
+    counts = {bound: after[bound] - before[bound] for bound in sorted(after)}
+    return next(bound for bound, count in counts.items() if count >= share * counts[float("inf")])
+
+
+def ended(process: subprocess.Popen[bytes] | subprocess.Popen[str]) -> None:
     """Whatever it does, it is over."""
     if process.poll() is None:
         process.send_signal(signal.SIGCONT)

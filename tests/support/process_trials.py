@@ -125,7 +125,8 @@ def _reacts(bench: ProcessBench, way: Way, dice: random.Random) -> tuple[float |
         return latency_ms, [f"mode {bench.mode}"]
     if way.mode == "FAULT":  # the bus cannot tell whether the gateway or the fault has silenced it
         latency_ms = (told["t_ns"] - begin_ns) / MS
-    return latency_ms, [] if latency_ms <= way.within_ms else [f"FAULT only after {latency_ms:.0f} ms"]
+        return latency_ms, [] if latency_ms <= way.within_ms else [f"FAULT only after {latency_ms:.0f} ms"]
+    return latency_ms, []
 
 
 # ---- the faults
@@ -136,8 +137,6 @@ Inject = Callable[[ProcessBench, random.Random], int]
 
 def _controller_signalled(number: signal.Signals) -> Inject:
     return lambda bench, dice: bench.controller.signal(number)
-
-
 
 
 def _another_controller(bench: ProcessBench) -> None:
@@ -198,6 +197,7 @@ def _strangers(bench: ProcessBench, dice: random.Random) -> int:
 
 def _quiet_again(bench: ProcessBench) -> None:
     _babbler(bench).ask(rate_hz=0)
+    time.sleep(HELD_BACK_S)  # frames that were handed to the controller before the fault was found get out now; no operator is so quick
 
 
 def _gateway_signalled(number: signal.Signals) -> Inject:
