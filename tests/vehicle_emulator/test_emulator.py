@@ -37,6 +37,9 @@ def run(car: Emulator, milliseconds: int, frames_at=lambda _: (), start_ns: int 
 class Gateway(GatewayStub):
     """Arms, engages after 200 ms and commands from 300 ms on, every 10 ms."""
 
+    def __init__(self, car: Emulator) -> None:
+        super().__init__(CATALOGUE, lambda: car._robots.watchdog_question)
+
     def __call__(self, k: int) -> list[CanFrame]:
         if k % 10:
             return []
@@ -75,7 +78,8 @@ def test_a_stall_of_the_caller_brings_no_burst():
 def test_frames_carry_good_end_to_end_protection_and_decode():
     receivers = {spec.arbitration_id: E2EReceiver(spec.e2e_data_id) for spec in OWN.values() if spec.e2e_data_id is not None}
     judged = 0
-    for frame in run(emulator(), 300, Gateway(CATALOGUE)):
+    car = emulator()
+    for frame in run(car, 300, Gateway(car)):
         CATALOGUE.decode(CATALOGUE.by_id[frame.arbitration_id], frame)
         if (receiver := receivers.get(frame.arbitration_id)) is not None:
             assert receiver.check(frame.data) in (E2EStatus.INITIAL, E2EStatus.OK)
@@ -85,7 +89,8 @@ def test_frames_carry_good_end_to_end_protection_and_decode():
 
 def test_same_seed_and_frames_give_the_same_bytes():
     def record(seed: int) -> list[CanFrame]:
-        return run(emulator(seed=seed), 1000, Gateway(CATALOGUE))
+        car = emulator(seed=seed)
+        return run(car, 1000, Gateway(car))
 
     first = record(3)
     assert first == record(3)
@@ -94,7 +99,7 @@ def test_same_seed_and_frames_give_the_same_bytes():
 
 def test_follows_the_gateway():
     car = emulator()
-    run(car, 1500, Gateway(CATALOGUE))
+    run(car, 1500, Gateway(car))
     truth = car.truth()
     assert truth.are_robots_engaged
     assert math.degrees(truth.sr_angle_rad) == pytest.approx(15.0, abs=0.3)  # half the lash of the robot, and its encoder
@@ -107,7 +112,7 @@ def test_what_the_bus_says_is_the_truth_of_a_moment_ago():
     car = emulator()
     past: list[tuple[float, float]] = []
     navigation = CATALOGUE.by_name["PosLocal"]
-    gateway = Gateway(CATALOGUE)
+    gateway = Gateway(car)
     for k in range(1, 1501):
         frames = car.step(k * STEP_NS, gateway(k))
         past.append((car.truth().state.x_m, car.truth().state.y_m))
@@ -141,7 +146,7 @@ def test_a_car_that_starts_at_rest_stays_at_rest():
 
 def test_stops_by_itself_when_the_gateway_dies():
     car = emulator()
-    gateway = Gateway(CATALOGUE)
+    gateway = Gateway(car)
     run(car, 12_000, lambda k: gateway(k) if k < 1000 else ())
     truth = car.truth()
     assert abs(truth.state.vx_mps) < 1e-2
@@ -215,7 +220,7 @@ def test_faults_reach_the_part_that_they_are_about():
     assert {CATALOGUE.by_id[frame.arbitration_id].sender for frame in run(gone, 100)} == {"SR", "AR", "BR", "RC", "CAR"}
     held, slippery, stopped = emulator(faults=[stuck]), emulator(faults=[ice]), emulator(faults=[released])
     for car in (held, slippery, stopped):
-        run(car, 1500, Gateway(CATALOGUE))
+        run(car, 1500, Gateway(car))
     assert abs(held.truth().sr_angle_rad) < 0.01
     assert slippery.truth().state.yaw_rate_radps < 0.03
     assert not stopped.truth().are_robots_engaged
@@ -225,14 +230,14 @@ def test_faults_reach_the_part_that_they_are_about():
 def test_frames_of_both_directions_pass_the_faults():
     lost = {"name": "lost", "kind": "drop", "messages": "SR_Command", "from_s": 0.0}
     deaf = emulator(faults=[lost])
-    run(deaf, 1500, Gateway(CATALOGUE))
+    run(deaf, 1500, Gateway(deaf))
     assert not deaf.truth().are_robots_engaged
     assert deaf.faults.faults[0].hits > 100
 
 
 def test_on_the_lift_the_bench_turns_and_the_virtual_car_drives():
     car, start = emulator(is_lifted=True), StartPose()
-    run(car, 1500, Gateway(CATALOGUE))
+    run(car, 1500, Gateway(car))
     truth = car.truth()
     assert truth.is_lifted
     assert math.degrees(truth.sr_angle_rad) == pytest.approx(15.0, abs=0.3)  # half the lash of the robot, and its encoder
