@@ -16,7 +16,6 @@ from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, 
 from gateway.commands import MAX_STATE_LAG, CommandGate
 from gateway.conditions import (
     COMMAND_TIMEOUT_NS,
-    MAX_REQUEST_AHEAD_NS,
     UNDISTURBED,
     Situation,
     Surroundings,
@@ -232,7 +231,8 @@ class GatewayCore:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
         if refused := untimely(request, situation.now_ns, last_ns):
             return [refused]
-        self._last_request_ns = max(min(request.t_ns, situation.now_ns + MAX_REQUEST_AHEAD_NS), last_ns)  # a STOP may be of any time
+        if request.operation is not Operation.STOP:  # which acts whatever its date is: that says nothing about those after it
+            self._last_request_ns = max(request.t_ns, last_ns)
         trigger = _TRIGGER_OF_OPERATION.get(request.operation) or REACTIONS[_CAUSE_OF_OPERATION[request.operation]]
         if (self.mode, trigger) not in TRANSITIONS:
             return [f"not possible in {self.mode.name}"]

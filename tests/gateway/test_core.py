@@ -444,9 +444,9 @@ def test_a_stop_from_the_future_does_not_hold_up_what_is_asked_now():
     drive.tick()
     assert drive.core.mode is Mode.STANDBY
     drive.ask(Operation.RESET)
-    drive._to_send = replace(drive._to_send, t_ns=drive.now_ns)  # the time of the stop: not after it
+    drive._to_send = replace(drive._to_send, t_ns=drive.now_ns)
     drive.tick()
-    assert drive.output.reply.refusals == ("the request is repeated, or made before another one",)
+    assert drive.output.reply.refusals == ("not possible in STANDBY",)  # looked at: the date of a stop says nothing about others
     drive.arm()
 
 
@@ -501,6 +501,7 @@ def test_a_reset_is_no_second_disengagement():
     drive.tick()
     assert drive.core.mode is Mode.STANDBY
     assert drive.core.disengagement is ended
+    assert drive.core.reason == "operator reset"
 
 
 def heard(drive, name, ticks):

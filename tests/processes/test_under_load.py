@@ -16,7 +16,7 @@ from tests.support.quiet import Quiet
 pytestmark = [pytest.mark.realtime, pytest.mark.long, pytest.mark.timeout(4 * 3_600)]
 
 HOGS = 4
-LOADED_S, LOADED_UNPRIVILEGED_S = 20.0, 20.0
+LOADED_S, SETTLING_S, UNPRIVILEGED_S = 600.0, 60.0, 60.0
 ATTEMPTS = 4
 MAX_LATENESS_MS = 1.0
 MAX_GROWTH_MB = 10.0
@@ -65,26 +65,30 @@ def drive_in_a_circle(bench: ProcessBench) -> int:
 
 @pytest.mark.req("F16", "F17", "G1")
 def test_ten_minutes_of_load_disengage_nobody(figure):
-    for attempt in range(ATTEMPTS):
+    for _ in range(ATTEMPTS):
         with rig() as bench:
             if not bench.metrics()[FIFO]:
                 pytest.skip("SCHED_FIFO is not permitted here; `ulimit -r` or CAP_SYS_NICE")
             begin = drive_in_a_circle(bench)
-            before, before_mb = bench.buckets("tick_lateness_seconds"), resident_mb(bench.gateway.pid)
+            before, sizes_mb = bench.buckets("tick_lateness_seconds"), [resident_mb(bench.gateway.pid)]
             with Quiet() as quiet, loaded(bench):
-                time.sleep(LOADED_S)
-                after, after_mb = bench.buckets("tick_lateness_seconds"), resident_mb(bench.gateway.pid)
+                for pause_s in (SETTLING_S, LOADED_S - SETTLING_S):
+                    time.sleep(pause_s)
+                    sizes_mb.append(resident_mb(bench.gateway.pid))
+                after = bench.buckets("tick_lateness_seconds")
             changes = [line["mode"] for line in bench.controller.said[begin:] if "mode" in line]
             violations = bench.violations()
+        # In ten minutes a virtual machine always stands still once: who has ridden that out has passed, who has not may try again.
         if not (changes or violations) or not quiet.disturbance:
             break
-        figure(f"attempt {attempt} is inconclusive: {quiet.disturbance}")
+    figure(f"the machine in these ten minutes: {quiet.disturbance or 'undisturbed'}")
     minutes = LOADED_S / 60.0
     figure(f"{HOGS} CPU hogs, memory pressure, stalled and flooding Zenoh peers, {minutes:g} min: disengagements", len(changes), "", "= 0")
     figure("violations found by the bus oracle", len(violations), "", "= 0")
     lateness_ms = percentile_s(before, after, 0.99) * 1e3
     is_punctual = figure("tick lateness, p99 (upper end of its bucket)", lateness_ms, "ms", f"<= {MAX_LATENESS_MS:g}")
-    is_bounded = figure("growth of the gateway's memory", after_mb - before_mb, "MB", f"<= {MAX_GROWTH_MB:g}")
+    figure("growth of the gateway's memory in the first minute: buffers for the flood", sizes_mb[1] - sizes_mb[0], "MB")
+    is_bounded = figure("growth of the gateway's memory after that", sizes_mb[2] - sizes_mb[1], "MB", f"<= {MAX_GROWTH_MB:g}")
     assert (changes, violations) == ([], [])
     assert is_punctual
     assert is_bounded
@@ -97,10 +101,10 @@ def test_without_real_time_priority_a_loaded_machine_is_safe(figure):
         assert not bench.metrics()[FIFO]
         begin = drive_in_a_circle(bench)
         with loaded(bench):
-            time.sleep(LOADED_UNPRIVILEGED_S)
+            time.sleep(UNPRIVILEGED_S)
         changes = [line["mode"] for line in bench.controller.said[begin:] if "mode" in line]
         violations = bench.violations()
-    figure(f"without SCHED_FIFO, {LOADED_UNPRIVILEGED_S:g} s of load: modes after ENGAGED: {', '.join(changes) or 'none'}")
+    figure(f"without SCHED_FIFO, {UNPRIVILEGED_S:g} s of load: modes after ENGAGED: {', '.join(changes) or 'none'}")
     figure("without SCHED_FIFO: violations found by the bus oracle", len(violations), "", "= 0")
     assert "ENGAGED" not in changes  # nothing engages again by itself
     assert violations == []

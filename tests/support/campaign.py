@@ -6,7 +6,6 @@ are tried from a handful of drives.
 """
 
 import copy
-import copyreg
 import random
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -22,8 +21,6 @@ from gateway.pacing import Pacer
 from tests.support.bus_oracle import BusOracle
 from tests.support.oracle_limits import REACTIONS
 from tests.support.robots import StubCar
-
-copyreg.pickle(type({}.keys()), lambda keys: (frozenset, (list(keys),)))
 
 MS = 1_000_000
 TICK_NS = 10 * MS

@@ -136,7 +136,7 @@ REACTIONS = {
     "F9": Reaction(Kind.STOP, 150 * MS, "B3 F9: 20 % lost or 120 ms late"),
     "F9 mild": Reaction(Kind.NONE, 0, "B3 F9: 1 % lost: no disengagement in 10 min"),
     "F9 any": Reaction(Kind.ANY, 0, "B3 F9: never a violation of a limit"),
-    "F10": Reaction(Kind.SILENCE, 60 * MS, "B3 F10: found in 50 ms; stop sending", 150 * MS),
+    "F10": Reaction(Kind.SILENCE, 62 * MS, "B3 F10: found in 50 ms, and one step (11.25 ms); stop sending", 150 * MS),
     "F11": Reaction(Kind.STOP, 150 * MS, "B3 F11: own frames do not get through"),
     "F11 idle": Reaction(Kind.NONE, 0, "B3 F11: unknown identifiers that leave the bus its time"),
     "F12": Reaction(Kind.SILENCE, 10 * MS, "B3 F12: the gateway is dead; the robots let go after 110 ms", 40 * MS),
@@ -145,6 +145,6 @@ REACTIONS = {
     "F15": Reaction(Kind.NONE, 0, "B3 F15: control unchanged"),
     "F17": Reaction(Kind.STOP, 150 * MS, "B3 F17: as F1"),
     "F17 telemetry": Reaction(Kind.NONE, 0, "B3 F17: what the gateway does not obey may be lost or flooded"),
-    "second sender": Reaction(Kind.SILENCE, 10 * MS, "issue, Gate: a second sender of our own identifiers is detected; in the same tick"),
+    "second sender": Reaction(Kind.SILENCE, 12 * MS, "issue, Gate: a second sender of our own identifiers; in one step (11.25 ms)"),
     "E3": Reaction(Kind.RELEASE, 12 * MS, "B3 E3: the driver ends ENGAGED in the same tick (up to 11.25 ms)", 50 * MS),
 }

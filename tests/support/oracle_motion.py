@@ -143,10 +143,13 @@ class MotionJudge:
             self._violate(t_ns, "lateral jerk", f"{(now_mps2 - was_mps2) / elapsed_s:.2f} m/s3")
 
     def _judge_tail(self, t_ns: int, angle_deg: float) -> None:
-        """After the end of any plan the angle is held, unless the limits hold it back, which loosen as the car becomes slower."""
+        """After the end of any plan the angle is held, unless the limits hold it back, which loosen as the car becomes slower.
+
+        In a comfort stop the controller goes on steering.
+        """
         before_ns, before_deg = self._angles[-1]
         is_free = abs(self._lateral_mps2(angle_deg, self._seen.fastest_mps)) < 0.9 * self._limits.lateral_acceleration_mps2
-        is_over = self._is_stop and before_ns - self._entered_ns > PLAN_TAIL_NS + _TAIL_MARGIN_NS
+        is_over = self._is_stop and self._told != "ComfortStop" and before_ns - self._entered_ns > PLAN_TAIL_NS + _TAIL_MARGIN_NS
         if is_over and is_free and abs(angle_deg - before_deg) > _STEER_LSB_DEG:
             self._violate(t_ns, "steering tail", f"{angle_deg - before_deg:.2f} deg in one frame after the end of any plan")
 
