@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from tests.support.processes import new_xilgate
+from tests.support.processes import xilgate
 from tests.support.quiet import Quiet
 
 ATTEMPTS = 4
@@ -17,7 +17,7 @@ SECONDS = 30
 def test_a_millisecond_each_way(figure):
     for _ in range(ATTEMPTS):
         with Quiet() as quiet:
-            finished = new_xilgate("bench", "latency", "--json", "--seconds", str(SECONDS))
+            finished = xilgate("bench", "latency", "--json", "--seconds", str(SECONDS))
         if not quiet.disturbance:
             break
     assert not quiet.disturbance, "inconclusive"

@@ -33,6 +33,7 @@ def rig():
         gateway = start_xilgate("gateway", "--rig", str(file))
         try:
             wait_until((file.parent / "operator.sock").exists, 30, "the gateway")
+            assert xilgate("operate", "stop", "--rig", str(file)).returncode == 1  # it steps: what was asked before does not act
             yield file
         finally:
             end(gateway)
