@@ -96,9 +96,10 @@ class BusSet:
         """Load and rates of the bus of every network, as far as its filters let it be seen; empty without a node."""
         return {network: link.traffic for network, link in self._by_network.items()}
 
-    def filenos(self) -> list[int]:
-        """Descriptors that are readable when something has arrived, of the buses that have one."""
-        return [fileno for link in self._links.values() if (fileno := link.fileno()) >= 0]
+    def filenos(self, network: str) -> list[int]:
+        """Descriptor that is readable when something has arrived on the bus of a network; none where the bus has none."""
+        fileno = self._by_network[network].fileno()
+        return [fileno] if fileno >= 0 else []
 
     def recover(self) -> None:
         """Allow all attempts to leave bus-off again, on every bus; for the operator alone to ask for."""

@@ -112,6 +112,10 @@ class Actuation:
         """Drive demand that two pedal positions stand for; the inverse of the split."""
         return accelerator_norm - brake_norm * self._full_brake_mps2 / self._full_drive_mps2
 
+    def pass_time(self, elapsed_ns: int) -> None:
+        """Tell how long the last demand has stood [ns], for the rates; of more than a tick a tick counts, until told otherwise."""
+        self._tick_s = clamp(elapsed_ns, self._tick_ns // 10, self._tick_ns) * 1e-9
+
     def release(self) -> None:
         """Ask for nothing."""
         self.demand = NEUTRAL

@@ -10,7 +10,6 @@ from gateway.core import TICK_NS
 from gateway.cycle import ControlCycle, Links
 from gateway.housekeeping import Housekeeper, Orders, Pulse
 from gateway.logs import LogThread
-from gateway.loop import ArrivalWait
 from gateway.metrics import MetricsServer
 from gateway.pacing import Pacer
 from gateway.practice import realtime_practice
@@ -51,7 +50,7 @@ def run(
         pulse.realtime = opened.enter_context(realtime_practice(rig.realtime))
         links = Links(buses, channel, operators, telemetry, recorder)
         cycle = ControlCycle(preparation, boot_id, links, pulse, orders)
-        arrivals = ArrivalWait(links.filenos)
+        arrivals = links.wait()
         pacer = Pacer(time.monotonic_ns(), TICK_NS)
         while not cycle.is_over:
             cycle.look(arrivals.wait(pacer.deadline_ns), pacer)

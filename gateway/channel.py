@@ -20,6 +20,8 @@ from gateway.messages import MAX_DATAGRAM_BYTES, ControlCommand, Operation, Oper
 
 MAX_DATAGRAMS_PER_POLL = 256
 """Bound on one poll, so that a flood cannot hold the caller's loop."""
+RECONNECT_NS = 10_000_000
+"""How often a peer that is silent is looked for [ns]."""
 REPLY_TIMEOUT_S = 1.0
 _SOCKET_MODE = 0o660
 """Less the umask of the process: nobody but its user, and its group if that is what the umask says."""
@@ -148,6 +150,7 @@ class Channel(_Socket):
     def __init__(self, bind: Path, peer: Path, key: bytes) -> None:
         super().__init__(key)
         self._peer = str(peer)
+        self._connect_ns = 0
         self._newest: dict[type, VehicleState | ControlCommand] = {}
         self._bind(bind)
         self._connect()
@@ -167,7 +170,8 @@ class Channel(_Socket):
         """The newest message of a kind that has arrived since it was last asked for, or None."""
         self._poll()
         message = self._newest.pop(kind, None)
-        if message is None:
+        if message is None and (now_ns := time.monotonic_ns()) >= self._connect_ns:
+            self._connect_ns = now_ns + RECONNECT_NS
             self._connect()
         return message if isinstance(message, kind) else None
 

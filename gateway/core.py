@@ -266,6 +266,8 @@ class GatewayCore:
     def _actuate(self, now_ns: int) -> None:
         """Choose what the robots are to do in this mode."""
         m, command = self.measurement, self.commands.newest
+        if self._last_step_ns is not None:
+            self.actuation.pass_time(now_ns - self._last_step_ns)
         if self.mode is Mode.ENGAGED and command is not None:
             k = plan_index(command, now_ns)
             self.actuation.follow(command.plan_steer_rad[k], command.plan_drive_norm[k], m.vx_mps, m.brake_norm)

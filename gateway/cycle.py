@@ -4,6 +4,7 @@ import logging
 import time
 from dataclasses import dataclass
 
+from dbc.catalogue import NAVIGATION
 from dbc.frame import CanFrame
 from dbc.link import BusSet
 from gateway.channel import Channel, OperatorServer
@@ -12,6 +13,7 @@ from gateway.core import StepOutput
 from gateway.ending import Ending
 from gateway.housekeeping import Notice, Orders, Pulse
 from gateway.journal import Glance, StepArguments
+from gateway.loop import ArrivalWait
 from gateway.messages import ControlCommand, Operation, OperatorReply, OperatorRequest
 from gateway.modes import DRIVING, QUIET
 from gateway.pacing import Pacer
@@ -37,9 +39,9 @@ class Links:
     telemetry: Publisher
     recorder: Recorder | None
 
-    def filenos(self) -> list[int]:
-        """Descriptors of what the control thread waits for."""
-        return [*self.buses.filenos(), self.channel.fileno()]
+    def wait(self) -> ArrivalWait:
+        """What the control thread waits for: what makes a state, and what answers one. The rest is taken along."""
+        return ArrivalWait(lambda: self.buses.filenos(NAVIGATION), self.channel.fileno())
 
 
 class ControlCycle:
@@ -76,7 +78,7 @@ class ControlCycle:
         if command is not None:
             self._command = command
             pacer.command_arrived(now_ns)
-        if pacer.is_due(now_ns, self._command is not None):
+        if pacer.is_due(now_ns):
             self._pulse.lateness.observe(max(now_ns - pacer.deadline_ns, 0))
             pacer.stepped(now_ns)
             self._step(now_ns, frames, pacer.overruns, cpu_start_ns)

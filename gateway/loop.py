@@ -9,8 +9,10 @@ from collections.abc import Callable
 BUCKETS_NS = tuple(bound_us * 1_000 for bound_us in (20, 50, 100, 200, 500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000, 100_000))
 """Upper ends of the buckets of a histogram [ns]; what is longer falls into one more."""
 
-SPACING_NS = 500_000
-"""Shortest time between two wake-ups for what arrives [ns]: 2,000 frames/s, or a flood, must not mean as many wake-ups."""
+SPACING_NS = 700_000
+"""Shortest time from a wake-up to the next one for frames [ns]: 2,000 of them a second, or a flood, must not mean as many wake-ups."""
+LONGEST_NS = 5_000_000
+"""Longest sleep [ns]: what is not waited for has a time of arrival that is no more than this late."""
 
 
 class Histogram:
@@ -34,29 +36,36 @@ class Histogram:
 
 
 class ArrivalWait:
-    """Sleeps until something has arrived, or a deadline has come.
+    """Sleeps until something has arrived that is urgent, or a deadline has come.
 
     Args:
-        filenos: gives the descriptors to watch, each time anew; those that are not usable are left out for that time.
+        frames: gives the descriptors of what comes many times, each time anew; those that are not usable are left out for that time.
+        command: a descriptor of what comes rarely, and must not wait at all.
     """
 
-    def __init__(self, filenos: Callable[[], list[int]]) -> None:
-        self._filenos = filenos
-        self._last_ns = 0
+    def __init__(self, frames: Callable[[], list[int]], command: int) -> None:
+        self._frames = frames
+        self._command = command
+        self._last_ns = time.monotonic_ns()
 
     def wait(self, deadline_ns: int) -> int:
-        """The monotonic time of the wake-up [ns]; never sooner than `SPACING_NS` after the one before."""
-        earliest_ns = min(self._last_ns + SPACING_NS, deadline_ns)
-        if (spare_ns := earliest_ns - time.monotonic_ns()) > 0:
-            time.sleep(spare_ns * 1e-9)
-        remaining_s = (deadline_ns - time.monotonic_ns()) * 1e-9
-        if remaining_s > 0.0:
-            try:
-                select.select(self._filenos(), [], [], remaining_s)
-            except (OSError, ValueError):  # a bus that has just gone
-                time.sleep(min(remaining_s, SPACING_NS * 1e-9))
+        """The monotonic time of the wake-up [ns]: `LONGEST_NS` after the one before at most, for frames `SPACING_NS` at least."""
+        deadline_ns = min(deadline_ns, self._last_ns + LONGEST_NS)
+        if not self._sleep([self._command], min(self._last_ns + SPACING_NS, deadline_ns)):
+            self._sleep([*self._frames(), self._command], deadline_ns)
         self._last_ns = time.monotonic_ns()
         return self._last_ns
+
+    def _sleep(self, descriptors: list[int], until_ns: int) -> bool:
+        """Whether something has arrived."""
+        remaining_s = (until_ns - time.monotonic_ns()) * 1e-9
+        if remaining_s <= 0.0:
+            return False
+        try:
+            return bool(select.select(descriptors, [], [], remaining_s)[0])
+        except (OSError, ValueError):  # a bus that has just gone
+            time.sleep(min(remaining_s, SPACING_NS * 1e-9))
+            return False
 
 
 class PeriodicLoop:

@@ -1,17 +1,18 @@
 """When the gateway steps: once a period, in step with the commands.
 
 A command that had to wait for the next tick of a free-running loop would wait half a period on average. So the loop runs a
-little slow while commands come, and a command that arrives shortly before the deadline pulls the step forward to itself: from
-then on nearly every command is answered on the bus as it arrives. No two steps are closer than the messages' rate allows, and
-a stall is skipped, not caught up with.
+little slow while commands come, and the time that this leaves over is a credit: a command that arrives early pulls the step
+forward to itself, as far as the credit goes. From then on nearly every command is answered on the bus as it arrives. The mean
+period is never shorter than the nominal one, whatever arrives, and a stall is skipped, not caught up with.
 """
 
-PULL_NS = 1_500_000
-"""How far a command may pull a step forward [ns]: 8.5 ms between two frames of a cycle time of 10 ms are 1.18 times the nominal rate."""
-DRIFT_NS = 250_000
-"""How much longer the periods are while commands come [ns]: four of them leave 1 ms for the jitter of a controller at 25 Hz."""
-SHIFT_NS = 1_000_000
-"""How much later the next step is when a command came at the wrong time [ns]; once a period, so that a flood of them holds nothing up."""
+DRIFT_NS = 500_000
+"""How much longer the periods are while commands come [ns]: four of them make the deadline of a controller at 25 Hz 2 ms later than its
+command, which may then come as much too early or too late; and after five commands of any phase one is in time."""
+PULL_NS = 4_000_000
+"""How far a command may pull a step forward [ns]: 6 ms are between two frames of a cycle time of 10 ms then."""
+CREDIT_NS = 6_000_000
+"""Most time that is kept [ns]; what one pull leaves of it is enough for the next."""
 FLOW_NS = 100_000_000
 """Time after the last command for which commands are said to come [ns]: their age limit."""
 
@@ -30,26 +31,27 @@ class Pacer:
     def __init__(self, start_ns: int, period_ns: int) -> None:
         self._period_ns = period_ns
         self._last_command_ns: int | None = None
-        self._is_shifted = False
+        self._credit_ns = CREDIT_NS
+        self._is_pulled = False
         self.deadline_ns = start_ns + period_ns
         self.overruns = 0
 
     def command_arrived(self, now_ns: int) -> None:
-        """Tell of a command; when it came too early to be answered at once, the next step is later, and so nearer to the next command."""
+        """Tell of a command. One that is too early waits for the deadline: to be answered a little sooner would use up the credit."""
         self._last_command_ns = now_ns
-        if not self._is_shifted and now_ns < self.deadline_ns - PULL_NS:
-            self._is_shifted = True
-            self.deadline_ns += SHIFT_NS
+        self._is_pulled |= now_ns >= self.deadline_ns - min(self._credit_ns, PULL_NS)
 
-    def is_due(self, now_ns: int, has_command: bool) -> bool:
+    def is_due(self, now_ns: int) -> bool:
         """Whether to step now."""
-        return now_ns >= self.deadline_ns - (PULL_NS if has_command else 0)
+        return self._is_pulled or now_ns >= self.deadline_ns
 
     def stepped(self, now_ns: int) -> None:
         """Set the next deadline after a step that was due at `now_ns`."""
-        self._is_shifted = False
         pulled_to_ns = min(now_ns, self.deadline_ns)
         skipped = (now_ns - pulled_to_ns) // self._period_ns
         self.overruns += skipped
         is_flowing = self._last_command_ns is not None and now_ns - self._last_command_ns < FLOW_NS
-        self.deadline_ns = pulled_to_ns + (skipped + 1) * self._period_ns + (DRIFT_NS if is_flowing else 0)
+        drift_ns = DRIFT_NS if is_flowing else 0
+        self._credit_ns = min(self._credit_ns - (self.deadline_ns - pulled_to_ns) + drift_ns, CREDIT_NS)
+        self._is_pulled = False
+        self.deadline_ns = pulled_to_ns + (skipped + 1) * self._period_ns + drift_ns

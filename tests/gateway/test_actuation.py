@@ -185,6 +185,21 @@ def test_steering_angle():
     assert activation(gate, "steering angle")[3] == -1.57
 
 
+@pytest.mark.req("G4")
+def test_a_demand_that_stood_for_less_than_a_tick_may_change_by_less():
+    for elapsed_ns, share in ((TICK_NS, 1.0), (6 * TICK_NS // 10, 0.6), (5 * TICK_NS, 1.0), (0, 0.1)):
+        gate = actuation(PROVING_GROUND)
+        gate.pass_time(elapsed_ns)
+        gate.follow(0.2, 1.0, 0.0, 0.0)
+        assert gate.demand.steering_wheel_rad == pytest.approx(share * 0.139, abs=math.radians(0.05))
+        assert gate.acceleration_mps2 == pytest.approx(share * 0.2, abs=0.001)
+        assert activation(gate, "steering rate")[1:] == (
+            pytest.approx(0.2 * 14.7 / (share * 0.01), rel=1e-3),
+            13.9,
+            pytest.approx(13.9, abs=math.radians(0.05) / (share * 0.01)),
+        )
+
+
 def test_the_end_stop_of_the_car_counts_too():
     gate = actuation(PROVING_GROUND)
     for _ in range(200):

@@ -183,7 +183,7 @@ def test_warm_up_hears_everything_and_leaves_the_gateway_as_new(bench):
 def test_a_state_is_sent_as_soon_as_the_navigation_data_are_new_and_not_again(bench):
     bench.tick(5)
     sent = len(bench.states)
-    bench.pacer.is_due = lambda now_ns, has_command: False
+    bench.pacer.is_due = lambda now_ns: False
     bench.tick()
     assert len(bench.states) == sent + 1
     assert bench.states[-1].t_ns == bench.now_ns
@@ -200,7 +200,7 @@ def test_a_command_that_came_between_two_steps_is_kept_for_the_next(bench):
     while len(bench.states) % 4 != 3:  # the next state, which comes between two steps, is answered with a command
         bench.tick()
     admitted = bench.cycle._core.commands.newest
-    bench.pacer.is_due = lambda now_ns, has_command: False
+    bench.pacer.is_due = lambda now_ns: False
     bench.tick(2)
     assert bench.cycle._command is not None
     assert bench.cycle._core.commands.newest is admitted

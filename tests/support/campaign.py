@@ -239,7 +239,7 @@ class World:
             if arrival_ns >= self.pacer.deadline_ns:
                 break
             self.pacer.command_arrived(arrival_ns)
-            if self.pacer.is_due(arrival_ns, has_command=True):
+            if self.pacer.is_due(arrival_ns):
                 return arrival_ns
         return self.pacer.deadline_ns
 

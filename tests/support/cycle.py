@@ -28,7 +28,7 @@ TREE = {
 class EveryTick(Pacer):
     """Steps whenever it is asked, so that a tick of the bench is a step."""
 
-    def is_due(self, now_ns, has_command):
+    def is_due(self, now_ns):
         return True
 
 

@@ -101,8 +101,8 @@ class MotionJudge:
             self._judge_pedals(t_ns)
 
     def _elapsed_s(self, t_ns: int, since_ns: int) -> float:
-        """Longest time that may lie between two frames; never less than a tick."""
-        return max(t_ns - since_ns + self._jitter_ns, _TICK_NS) * 1e-9
+        """Longest time that may lie between two frames."""
+        return max(t_ns - since_ns + self._jitter_ns, MS) * 1e-9
 
     def _lateral_mps2(self, angle_deg: float, speed_mps: float) -> float:
         return speed_mps * speed_mps * math.tan(math.radians(angle_deg) / self._car.steering_ratio) / self._car.wheelbase_m
