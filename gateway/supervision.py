@@ -24,6 +24,10 @@ FLOW_WINDOW_NS = 130_000_000
 MAX_LOST_FRAMES = 5
 """Frames lost in that time that are only counted, of about 160: with 1 % lost there are 2, with 20 % there are 31."""
 MAX_FLOW_CYCLE_NS = 10_000_000
+MAX_LULL_NS = 10_000_000
+"""Time without any frame that is usual [ns]: of messages with this cycle time that all come at once."""
+MAX_PAUSE_NS = 40_000_000
+"""What a pause of all senders may add to it within a window, in which nothing is lost [ns]; after a longer one all messages are missing."""
 
 _RULES = WindowRules(WINDOW_FRAMES, MAX_BAD_FRAMES, clean_ns=RECOVERY_NS)
 _MS_PER_NS = 1e-6
@@ -81,22 +85,28 @@ class Flow:
         self._frames_per_ns = sum(1.0 / cycle_ns for cycle_ns in cycles_ns.values())
         self._jitter_frames = len(cycles_ns)  # one of each message may just be on its way
         self._good = 0
-        self._before: tuple[int, int] | None = None
-        self._within: deque[tuple[int, int]] = deque()
+        self._paused_ns = 0
+        self._last_ns = 0
+        self._before: tuple[int, int, int] | None = None
+        self._within: deque[tuple[int, int, int]] = deque()
 
-    def note_good(self, spec: MessageSpec) -> None:
-        """Count a good frame."""
+    def note_good(self, spec: MessageSpec, t_ns: int) -> None:
+        """Count a good frame that arrived at `t_ns`."""
         self._good += spec.name in self._names
+        if t_ns > self._last_ns:  # of two buses, one is read after the other
+            self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
+            self._last_ns = t_ns
 
     def finding(self, now_ns: int) -> Finding | None:
         """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
-        self._within.append((now_ns, self._good))
+        paused_ns = self._paused_ns + max(now_ns - self._last_ns - MAX_LULL_NS, 0)
+        self._within.append((now_ns, paused_ns, self._good))
         while self._within[0][0] <= now_ns - FLOW_WINDOW_NS:
             self._before = self._within.popleft()
         if self._before is None:
             return None
-        then_ns, good_then = self._before
-        expected = (now_ns - then_ns) * self._frames_per_ns
+        then_ns, paused_then_ns, good_then = self._before
+        expected = (now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)) * self._frames_per_ns
         lost = expected - (self._good - good_then)
         limit = self._jitter_frames + MAX_LOST_FRAMES
         return Finding(Cause.FRAMES_LOST, 100.0 * lost / expected, 100.0 * limit / expected, "buses") if lost > limit else None
@@ -141,7 +151,7 @@ class Supervisor:
                     cause = "range"
             watch.note(frame.t_ns, cause is None)
             if cause is None:
-                self._flow.note_good(watch.spec)
+                self._flow.note_good(watch.spec, frame.t_ns)
             else:
                 self.rejected[f"{watch.spec.name}: {cause}"] += 1
         return values

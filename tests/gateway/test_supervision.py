@@ -149,7 +149,7 @@ def test_a_message_without_a_cycle_is_neither_expected_nor_counted_among_those_t
     flow = Flow([*specs, event])
     for k in range(20):
         for _ in range(100):
-            flow.note_good(event)
+            flow.note_good(event, k * 10 * MS)
         found = flow.finding(k * 10 * MS)
     assert found == Finding(Cause.FRAMES_LOST, 100.0, pytest.approx(100 * (len(FAST) + MAX_LOST_FRAMES) / (13 * len(FAST))), "buses")
 
@@ -219,7 +219,7 @@ def test_the_exact_number_of_losses():
         traffic = Traffic(*FAST)
         traffic.run(20, lambda _: True)
         to_lose = iter(range(lost))
-        found = traffic.run(9, lambda _, to_lose=to_lose: next(to_lose, None) is None)
+        found = traffic.run(9, lambda k, to_lose=to_lose: k == 0 or next(to_lose, None) is None)
         assert [(f.value, f.limit) for f in found[:1]] == (
             [(pytest.approx(100 * lost / expected), pytest.approx(100 * limit / expected))] if lost > limit else []
         )
@@ -229,5 +229,24 @@ def test_the_exact_number_of_losses():
 
 def test_a_short_time_says_nothing_and_slow_messages_are_not_counted():
     traffic = Traffic(*FAST, "NcomStatus05") if "NcomStatus05" in CATALOGUE.by_name else Traffic(*FAST)
-    assert traffic.run(13, lambda _: False) == []
-    assert traffic.run(1, lambda _: False)
+    assert traffic.run(13, lambda k: k == 0) == []
+    assert traffic.run(1, lambda k: k == 0)
+
+
+@pytest.mark.req("F9")
+def test_when_all_the_senders_pause_nothing_is_lost():
+    for pause_ticks in range(1, 5):  # after five every message is missing
+        traffic = Traffic(*FAST)
+        traffic.run(20, lambda _: True)
+        assert traffic.run(pause_ticks, lambda _: False) == []
+        assert traffic.run(20, lambda _: True) == []
+
+
+@pytest.mark.req("F9")
+def test_who_pauses_again_and_again_loses():
+    traffic = Traffic(*FAST)
+    traffic.run(20, lambda _: True)
+    found = []
+    for _ in range(7):
+        found += traffic.run(1, lambda _: False) + traffic.run(1, lambda _: True)
+    assert found
