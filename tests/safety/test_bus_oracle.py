@@ -454,6 +454,15 @@ def test_lost_frames_are_forgiven_where_the_oracle_may_lose_some_and_repeated_on
     assert "counter" in script.tick(1).rules
 
 
+def test_a_status_may_be_ahead_of_its_commands_by_two_of_them_where_a_bus_can_be_blocked():
+    for ticks, is_forgiven in ((1, True), (2, True), (4, False)):
+        script = Script(is_lossless=False).engage()
+        script.status, script.cause = "SafeStop", "BusBlocked"
+        script.tick(ticks)
+        script.go("Engage").tick(4)
+        assert script.rules == (set() if is_forgiven else {"status"}), ticks
+
+
 def test_crc_is_the_one_of_the_standard():
     assert crc8h2f(b"123456789") == 0xDF  # check value of CRC-8H2F, AUTOSAR SWS_CRCLibrary
     rng = random.Random(1)

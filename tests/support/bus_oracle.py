@@ -28,6 +28,7 @@ __all__ = ["Answer", "BusOracle", "Violation"]
 _TICK_NS = 10 * MS
 _RATE_WINDOW_NS = 1_000 * MS
 _DRIVER_NS = 100 * MS
+_MAX_EARLY_NS = 2 * _TICK_NS  # of each message two may be on their way
 _NEVER_NS = -(1 << 62)
 _NEUTRAL_MODES = ("Off", "Standby")
 _MAY_FOLLOW: dict[str, tuple[str | None, ...]] = {
@@ -108,6 +109,7 @@ class BusOracle:
         self._streams = {name: _Stream() for name in self._own}
         self._motion = MotionJudge(self._limits, self._car, self._seen, self._jitter_ns, self._violate)
         self._measurement_id: int | None = None
+        self._told_early: tuple[int, str] | None = None
         self.authority: str | None = None
 
     @property
@@ -224,6 +226,8 @@ class BusOracle:
             self._judge_change(t_ns, authority)
         is_continuous = t_ns - self._stopwatch.commanded_ns < 2 * _TICK_NS
         self._stopwatch.command(t_ns, authority)
+        if self._told_early is not None:
+            self._judge_told_early(t_ns, *self._told_early, is_continuous=is_continuous)
         if is_following and message.value(data, "CommandAge") > MAX_COMMAND_AGE_MS:
             self._violate(t_ns, "stale command", f"{message.value(data, 'CommandAge'):.0f} ms")
         if message.value(data, "MaxSpeed") > self._limits.max_speed_kmh:
@@ -255,6 +259,17 @@ class BusOracle:
         if speed_mps > STANDING_MPS and not is_taken and not is_asked:
             self._violate(t_ns, "abandoned", f"{step} at {speed_mps:.1f} m/s, and nobody has taken over")
 
+    def _judge_told_early(self, t_ns: int, told_ns: int, mode: str, *, is_continuous: bool) -> None:
+        """While a bus was blocked, a status may have overtaken its commands: older ones were still in the controller, which has few places.
+
+        Where it was blocked until the gateway fell silent, it is all that is left of them.
+        """
+        if mode in _TOLD.get(self.authority, ()) or not is_continuous:
+            self._told_early = None
+        elif t_ns - told_ns > _MAX_EARLY_NS + self._jitter_ns:
+            self._violate(told_ns, "status", f"mode {mode} while {self.authority}")
+            self._told_early = None
+
     def _judge_watchdog(self, t_ns: int, answer: int) -> None:
         live = [question for asked_ns, question in self._questions if t_ns - asked_ns <= WATCHDOG_ANSWER_NS]
         live = live or [question for _, question in self._questions][-1:]
@@ -280,7 +295,10 @@ class BusOracle:
         # In Fault nothing is commanded any more, not even to let go.
         is_commanding = t_ns - self._stopwatch.commanded_ns <= self._jitter_ns
         if mode not in _TOLD.get(self.authority, ()) and (is_commanding or mode != "Fault"):
-            self._violate(t_ns, "status", f"mode {mode} while {self.authority}")
+            if self._is_lossless:
+                self._violate(t_ns, "status", f"mode {mode} while {self.authority}")
+            elif self._told_early is None:
+                self._told_early = t_ns, mode
         if mode in ("SafeStop", "ComfortStop", "Fault") and cause == "None":
             self._violate(t_ns, "status", f"{mode} without a cause")
         self._motion.tell(t_ns, mode)
