@@ -75,6 +75,7 @@ class CanLink:
         self._lost_at_closed_ports = 0
         self._lost = 0
         self._care_ns = 0
+        self._refused_since_ns: int | None = None
 
     def receive(self) -> list[CanFrame]:
         """All frames of others that have arrived since the last call, oldest first."""
@@ -124,14 +125,23 @@ class CanLink:
             elif refusal := self._port.send(arbitration_id, data):
                 self.unsent["refused"] += 1
                 self._monitor.refused(refusal, now_ns)
-            elif self._port.has_echo:
-                self._confirmation.sent(arbitration_id, data, now_ns)
-            elif self._is_node:
-                self._meter.add(arbitration_id, data)
+                self._refused_since_ns = self._refused_since_ns or now_ns
+            else:
+                self._refused_since_ns = None
+                self._note_sent(arbitration_id, data, now_ns)
+
+    def _note_sent(self, arbitration_id: int, data: bytes, now_ns: int) -> None:
+        if self._port.has_echo:
+            self._confirmation.sent(arbitration_id, data, now_ns)
+        elif self._is_node:
+            self._meter.add(arbitration_id, data)
 
     def health(self) -> LinkHealth:
         """The bus as it is known now."""
-        return self._monitor.health(self._confirmation.oldest_ns(time.monotonic_ns()), self._has_given_up)
+        now_ns = time.monotonic_ns()
+        # A queue that another program keeps full blocks our frames before they are on their way.
+        refused_ns = 0 if self._refused_since_ns is None else now_ns - self._refused_since_ns
+        return self._monitor.health(max(self._confirmation.oldest_ns(now_ns), refused_ns), self._has_given_up)
 
     @property
     def traffic(self) -> Traffic:
@@ -162,6 +172,7 @@ class CanLink:
         self._recovery.rearm(self._monitor.state, self._monitor.bus_offs)
         self._reopening.rearm()
         self._confirmation.clear()
+        self._refused_since_ns = None
 
     def disturb(self, arbitration_id: int | None, count: int) -> bool:
         """Destroy the next transmissions of a message on the wire, for a bench; None: of any.

@@ -20,7 +20,8 @@ class LinkHealth:
 
     Args:
         tx_error_count, rx_error_count: error counters of the controller; -1 where the interface does not tell.
-        unconfirmed_ns: age of the oldest own frame that was handed over and has not been seen on the bus [ns]; 0 when there is none.
+        unconfirmed_ns: age of the oldest own frame that was handed over and has not been seen on the bus, or that was refused, as were
+            all since [ns]; 0 when there is none.
         bus_offs: times that the controller went bus-off since the start.
         last_bus_off_ns: monotonic time of the last one [ns]; None when there was none.
     """

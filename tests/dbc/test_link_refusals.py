@@ -3,6 +3,7 @@
 import errno
 import itertools
 import threading
+from dataclasses import replace
 from types import SimpleNamespace
 
 import can
@@ -139,7 +140,7 @@ def test_no_error_is_raised_and_none_makes_work(clock, opened, place, error, ids
 
 @pytest.mark.req("F10")
 @pytest.mark.parametrize("error", ["ENOBUFS", "CanOperationError ENOBUFS", "EAGAIN"])
-def test_ten_thousand_refusals_in_a_row_are_counted_and_forgotten(clock, opened, error):
+def test_ten_thousand_refusals_in_a_row_are_counted_and_forgotten_with_the_first_frame_that_is_taken(clock, opened, error):
     with CanLink("fake:0", IDS) as link:
         (bus,) = opened.buses
         bus.errors["send"] = ERRORS[error]
@@ -147,10 +148,23 @@ def test_ten_thousand_refusals_in_a_row_are_counted_and_forgotten(clock, opened,
             clock.tick()
             link.send([frame()])
         assert link.unsent == {"refused": 10_000}
-        assert link.health() == WELL
+        clock.tick()
+        assert link.health() == replace(WELL, unconfirmed_ns=10_000 * 10_000_000)  # a queue that others keep full blocks us
         bus.errors.clear()
         link.send([frame()])
         assert (bus.sent, link.unsent["refused"]) == ([SR_COMMAND], 10_000)
+        assert link.health() == WELL
+
+
+@pytest.mark.req("F10")
+def test_an_operator_who_lets_a_bus_recover_forgets_what_it_refused(clock, opened):
+    with CanLink("fake:0", IDS) as link:
+        opened.buses[0].errors["send"] = ERRORS["ENOBUFS"]
+        link.send([frame()])
+        clock.tick()
+        assert link.health() != WELL
+        link.recover()
+        assert link.health() == WELL
 
 
 @pytest.mark.req("F11")
