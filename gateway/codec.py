@@ -106,11 +106,17 @@ class Monitors:
     """What bus monitors are told.
 
     Args:
+        bus_load_norm, cpu_load_norm: see `conditions.Surroundings`.
+        rejected: frames that were not taken.
+        tx_error_count: of the CAN controllers, the largest; -1 where none tells.
         finding: why the last engagement ended; None when none has.
     """
 
     uptime_s: float
+    bus_load_norm: float
+    cpu_load_norm: float
     rejected: int
+    tx_error_count: int
     mode: Mode
     finding: Finding | None
 
@@ -227,7 +233,13 @@ class Codec:
         if finding is not None:
             found = {"Cause": self._cause_codes[finding.cause], "Value": finding.value, "Limit": finding.limit}
             status |= {name: clamp(value, *self._catalogue.bounds("GW_Status", name)) for name, value in found.items()}
-        heartbeat = {"UpTime": monitors.uptime_s, "RxErrorCount": min(monitors.rejected, 255)}
+        heartbeat = {
+            "UpTime": monitors.uptime_s,
+            "BusLoad": 100.0 * min(monitors.bus_load_norm, 1.0),
+            "CpuLoad": 100.0 * min(monitors.cpu_load_norm, 1.0),
+            "RxErrorCount": min(monitors.rejected, 255),
+            "TxErrorCount": clamp(monitors.tx_error_count, 0, 255),
+        }
         return [self._frame("GW_Heartbeat", heartbeat, now_ns), self._frame("GW_Status", status, now_ns)]
 
     def _frame(self, name: str, values: dict[str, float], now_ns: int) -> CanFrame:
@@ -240,7 +252,7 @@ class Codec:
 _REHEARSAL_NS = 0
 _REHEARSED_DEMAND = Demand(0.0, 0.0, 0.0)
 _REHEARSED_CYCLE = Cycle(0.0, 0, 0, is_navigation_valid=True)
-_REHEARSED_MONITORS = Monitors(0.0, 0, Mode.SILENT, Finding(Cause.TICK_GAP, 0.0, 0.0, ""))
+_REHEARSED_MONITORS = Monitors(0.0, 0.0, 0.0, 0, 0, Mode.SILENT, Finding(Cause.TICK_GAP, 0.0, 0.0, ""))
 
 _REQUEST_OF_MODE = {
     Mode.SILENT: "None",

@@ -59,11 +59,15 @@ class Surroundings:
         links: health of the bus of every network.
         is_recording: whether the recorder takes what it is given.
         disk_free_share: of the disk that it writes to.
+        bus_load_norm: share of the time in which the busiest of the buses carries a frame.
+        cpu_load_norm: share of a core that the control thread takes.
     """
 
     links: Mapping[str, LinkHealth] = field(default_factory=dict)
     is_recording: bool = True
     disk_free_share: float = 1.0
+    bus_load_norm: float = 0.0
+    cpu_load_norm: float = 0.0
 
 
 UNDISTURBED = Surroundings()

@@ -91,6 +91,7 @@ class GatewayCore:
         self._plausibility = Plausibility(vehicle, is_on_lift=not profile.are_wheels_on_the_road)
         self._gate = TransmitGate(catalogue)
         self._safe_stop: SafeStop | None = None
+        self._start_ns = 0
         self._last_step_ns: int | None = None
         self._good_since_ns: int | None = None
         self._state_time_ns = 0
@@ -133,6 +134,7 @@ class GatewayCore:
     ) -> StepOutput:
         """Advance to `now_ns` with what has arrived since the last step."""
         if self._last_request_ns is None:
+            self._start_ns = now_ns
             self._last_request_ns = now_ns - TICK_NS  # what was asked before this gateway lived does not act
         self._observe(now_ns, frames)
         self._admit(now_ns, command)
@@ -151,7 +153,7 @@ class GatewayCore:
         self.ticks += 1
         state, self._sensed = self._sensed or self._state(), None
         reply = None if request is None else OperatorReply(request.boot_id, request.seq, request.operation, self.mode, tuple(refused))
-        return StepOutput(self._gate.admit(now_ns, self.mode, self._encode(now_ns)), state, transition, reply)
+        return StepOutput(self._gate.admit(now_ns, self.mode, self._encode(now_ns, surroundings)), state, transition, reply)
 
     def sense(self, now_ns: int, frames: Sequence[CanFrame]) -> VehicleState | None:
         """Take frames in between two steps.
@@ -304,7 +306,7 @@ class GatewayCore:
             drive_norm=self.actuation.drive_norm(m.accelerator_norm, m.brake_norm),
         )
 
-    def _encode(self, now_ns: int) -> list[CanFrame]:
+    def _encode(self, now_ns: int, surroundings: Surroundings) -> list[CanFrame]:
         if self.mode is Mode.SILENT:
             return []
         m, frames = self.measurement, []
@@ -314,6 +316,14 @@ class GatewayCore:
             frames = self._codec.encode(now_ns, self.mode, self.actuation.demand, cycle)
         if self.ticks % self._monitor_ticks == 0:
             finding = None if self.disengagement is None else self.disengagement.finding
-            monitors = Monitors(self.ticks * TICK_NS * 1e-9, self.supervisor.rejected.total(), self.mode, finding)
+            monitors = Monitors(
+                uptime_s=(now_ns - self._start_ns) * 1e-9,
+                bus_load_norm=surroundings.bus_load_norm,
+                cpu_load_norm=surroundings.cpu_load_norm,
+                rejected=self.supervisor.rejected.total(),
+                tx_error_count=max((link.tx_error_count for link in surroundings.links.values()), default=-1),
+                mode=self.mode,
+                finding=finding,
+            )
             frames += self._codec.encode_monitors(now_ns, monitors)
         return frames

@@ -13,7 +13,7 @@ from gateway.core import StepOutput
 from gateway.ending import Ending
 from gateway.housekeeping import Notice, Orders, Pulse
 from gateway.journal import Glance, StepArguments
-from gateway.loop import ArrivalWait
+from gateway.loop import ArrivalWait, CpuLoad
 from gateway.messages import ControlCommand, Operation, OperatorReply, OperatorRequest
 from gateway.modes import DRIVING, QUIET
 from gateway.pacing import Pacer
@@ -68,6 +68,7 @@ class ControlCycle:
         self._command: ControlCommand | None = None
         self._glances: list[Glance] = []
         self._sent_seq = 0
+        self._cpu_load = CpuLoad()
         self.is_over = False
         self.successor: Preparation | None = None
 
@@ -93,7 +94,7 @@ class ControlCycle:
         links = self._links
         command, glances, request = self._command, self._glances, self._request(now_ns)
         self._command, self._glances = None, []
-        surroundings = self._surroundings(now_ns)
+        surroundings = self._surroundings(now_ns, cpu_start_ns)
         output = self._core.step(now_ns, frames, command, request, surroundings)
         links.buses.send(output.frames)
         if output.state.seq != self._sent_seq:
@@ -110,12 +111,13 @@ class ControlCycle:
         self._heed_orders(now_ns, output)
         self._pulse.ticks += 1
 
-    def _surroundings(self, now_ns: int) -> Surroundings:
-        health = self._links.buses.health()
-        if self._links.recorder is None:
-            return Surroundings(health)
-        self._record = self._links.recorder.poll(now_ns)
-        return Surroundings(health, self._record.is_recording, self._record.disk_free_share)
+    def _surroundings(self, now_ns: int, cpu_ns: int) -> Surroundings:
+        buses = self._links.buses
+        if self._links.recorder is not None:
+            self._record = self._links.recorder.poll(now_ns)
+        is_recording = self._record.is_recording or self._links.recorder is None
+        load_norm = max((traffic.load_norm for traffic in buses.traffic().values()), default=0.0)
+        return Surroundings(buses.health(), is_recording, self._record.disk_free_share, load_norm, self._cpu_load.update(now_ns, cpu_ns))
 
     def _answer(self, reply: OperatorReply) -> None:
         # A bus-off that is still there must not keep a reset from being granted. While the car is driven there is none to leave, and a

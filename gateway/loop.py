@@ -14,6 +14,8 @@ SPACING_NS = 700_000
 LONGEST_NS = 5_000_000
 """Longest sleep [ns]: what is not waited for has a time of arrival that is no more than this late."""
 
+_LOAD_WINDOW_NS = 1_000_000_000
+
 
 class Histogram:
     """Counts durations in fixed buckets; takes no memory while it counts, and may be read from another thread.
@@ -33,6 +35,24 @@ class Histogram:
         self.counts[bisect_left(BUCKETS_NS, duration_ns)] += 1
         self.sum_ns += duration_ns
         self.max_ns = max(self.max_ns, duration_ns)
+
+
+class CpuLoad:
+    """Share of a core that a thread takes, over about the last second."""
+
+    def __init__(self) -> None:
+        self._begin: tuple[int, int] | None = None
+        self._load_norm = 0.0
+
+    def update(self, now_ns: int, cpu_ns: int) -> float:
+        """The share, after `cpu_ns` of the thread's time [ns]; call it a few times a second."""
+        if self._begin is None:
+            self._begin = now_ns, cpu_ns
+        begin_ns, cpu_begin_ns = self._begin
+        if now_ns - begin_ns >= _LOAD_WINDOW_NS:
+            self._load_norm = (cpu_ns - cpu_begin_ns) / (now_ns - begin_ns)
+            self._begin = now_ns, cpu_ns
+        return self._load_norm
 
 
 class ArrivalWait:

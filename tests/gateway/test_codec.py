@@ -245,7 +245,8 @@ def test_the_alive_counter_counts():
 
 def monitors(**changes):
     """What heartbeat and status say."""
-    told_ = Monitors(uptime_s=12.5, rejected=7, mode=Mode.SAFE_STOP, finding=Finding(Cause.COMMAND_LOST, 101.5, 100.0, "controller"))
+    finding = Finding(Cause.COMMAND_LOST, 101.5, 100.0, "controller")
+    told_ = Monitors(12.5, bus_load_norm=0.42, cpu_load_norm=0.185, rejected=7, tx_error_count=96, mode=Mode.SAFE_STOP, finding=finding)
     frames = codec().encode_monitors(99, replace(told_, **changes))
     assert [frame.t_ns for frame in frames] == [99, 99]
     specs = [CATALOGUE.by_id[frame.arbitration_id] for frame in frames]
@@ -255,8 +256,11 @@ def monitors(**changes):
 
 def test_what_bus_monitors_are_told():
     heartbeat, status = monitors()
-    assert heartbeat == {"UpTime": 12.5, "BusLoad": 0, "CpuLoad": 0, "RxErrorCount": 7, "TxErrorCount": 0}
+    assert heartbeat == {"UpTime": 12.5, "BusLoad": 42, "CpuLoad": 18.5, "RxErrorCount": 7, "TxErrorCount": 96}
     assert status == {"Mode": 3, "Cause": 41, "Value": 101.5, "Limit": 100}
+    beyond, _ = monitors(bus_load_norm=1.01, cpu_load_norm=1.01, rejected=256, tx_error_count=256)
+    assert beyond == {"UpTime": 12.5, "BusLoad": 100, "CpuLoad": 100, "RxErrorCount": 255, "TxErrorCount": 255}
+    assert monitors(tx_error_count=-1)[0]["TxErrorCount"] == 0
     _, none = monitors(finding=None, mode=Mode.READY)
     assert none == {"Mode": 1, "Cause": 0, "Value": 0, "Limit": 0}
 

@@ -11,8 +11,10 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from dbc.frame import CanFrame
+from dbc.health import LinkHealth
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
+from gateway.conditions import Surroundings
 from gateway.core import ENGAGE_GRACE_NS, TICK_NS
 from gateway.messages import CommandStatus, Mode, Operation
 from tests.support.drive import GatewayDrive
@@ -515,6 +517,21 @@ def heard(drive, name, ticks):
     return found
 
 
+def test_bus_monitors_are_told_of_time_that_has_passed_and_of_what_is_around():
+    drive = GatewayDrive()
+    drive.arm()
+    links = {"robots": LinkHealth(tx_error_count=8), "navigation": LinkHealth(tx_error_count=97)}
+    drive.now_ns += 60_000_000_000  # however many steps there were in it
+    for _ in range(10):
+        drive.now_ns += 10_000_000
+        output = drive.core.step(drive.now_ns, [], surroundings=Surroundings(links, bus_load_norm=0.25, cpu_load_norm=0.5))
+        beats = [frame for frame in output.frames if frame.arbitration_id == drive.catalogue.by_name["GW_Heartbeat"].arbitration_id]
+        if beats:
+            beat = drive.catalogue.decode(drive.catalogue.by_name["GW_Heartbeat"], beats[0])
+    assert beat["UpTime"] == pytest.approx((drive.now_ns - 1_010_000_000) * 1e-9, abs=0.2)
+    assert (beat["BusLoad"], beat["CpuLoad"], beat["TxErrorCount"]) == (25, 50, 97)
+
+
 def test_what_bus_monitors_are_told_every_100_ms():
     drive = GatewayDrive()
     drive.core.step(drive.now_ns, [CanFrame(0x7FF, b"", drive.now_ns)] * 5)
@@ -523,7 +540,7 @@ def test_what_bus_monitors_are_told_every_100_ms():
     assert len(beats) in (2, 3)
     for tick, beat in beats.items():
         assert tick % 10 == 0
-        assert beat["UpTime"] == pytest.approx(tick * 0.01, abs=0.051)
+        assert beat["UpTime"] == pytest.approx((tick - 1) * 0.01, abs=0.051)
         assert beat["RxErrorCount"] == 5
     assert all(status == {"Mode": 1, "Cause": 0, "Value": 0, "Limit": 0} for status in heard(drive, "GW_Status", 20).values())
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from gateway import loop as loop_module
-from gateway.loop import BUCKETS_NS, LONGEST_NS, SPACING_NS, ArrivalWait, Histogram, PeriodicLoop
+from gateway.loop import BUCKETS_NS, LONGEST_NS, SPACING_NS, ArrivalWait, CpuLoad, Histogram, PeriodicLoop
 
 MS = 1_000_000
 
@@ -152,3 +152,11 @@ def test_a_descriptor_that_has_gone_is_no_reason_to_fail_or_to_spin():
             for _ in range(4):
                 arrivals.wait(start_ns + 1_000 * MS)
             assert start_ns + 4 * SPACING_NS <= time.monotonic_ns() < start_ns + 1_000 * MS
+
+
+def test_the_load_of_a_thread_is_that_of_the_last_second():
+    load, s = CpuLoad(), 1_000_000_000
+    assert [load.update(5 * s, 2 * s), load.update(6 * s - 1, 3 * s)] == [0.0, 0.0]
+    assert load.update(6 * s, 2 * s + s // 4) == 0.25
+    assert load.update(7 * s - 1, 3 * s) == 0.25
+    assert load.update(7 * s, 3 * s - s // 4) == 0.5
