@@ -454,6 +454,16 @@ def test_lost_frames_are_forgiven_where_the_oracle_may_lose_some_and_repeated_on
     assert "counter" in script.tick(1).rules
 
 
+def test_after_questions_have_been_missing_the_last_one_may_be_answered_for_a_little_longer():
+    for ticks, is_forgiven in ((6, True), (8, False)):
+        script = Script().engage()
+        script.answer = (script.question << 3 & 0xFF | script.question >> 5) ^ 0xA7
+        script.car, car = lambda name, values: None, script.car
+        script.tick(10)
+        script.car = car
+        assert script.tick(ticks).rules == (set() if is_forgiven else {"watchdog"}), ticks
+
+
 def test_a_status_may_be_ahead_of_its_commands_by_two_of_them_where_a_bus_can_be_blocked():
     for ticks, is_forgiven in ((1, True), (2, True), (4, False)):
         script = Script(is_lossless=False).engage()

@@ -28,6 +28,7 @@ __all__ = ["Answer", "BusOracle", "Violation"]
 _TICK_NS = 10 * MS
 _RATE_WINDOW_NS = 1_000 * MS
 _DRIVER_NS = 100 * MS
+_RESYNC_NS = 60 * MS
 _MAX_EARLY_NS = 2 * _TICK_NS  # of each message two may be on their way
 _NEVER_NS = -(1 << 62)
 _NEUTRAL_MODES = ("Off", "Standby")
@@ -102,7 +103,8 @@ class BusOracle:
         self._requests: dict[str, int] = {}
         self._driver_ns = _NEVER_NS
         self._question_counter = 0
-        self._questions: deque[tuple[int, int]] = deque(maxlen=8)
+        self._questions: deque[tuple[int, int]] = deque(maxlen=16)
+        self._asked_again_ns = _NEVER_NS
         self._start()
 
     def _start(self) -> None:
@@ -179,6 +181,8 @@ class BusOracle:
     def _learn_question(self, t_ns: int, message: WireMessage, data: bytes) -> None:
         step, self._question_counter = (counter_of(data) - self._question_counter) % 16, counter_of(data)
         if 1 <= step <= 3:  # AUTOSAR profile 2: a receiver may lose two frames in a row
+            if self._questions and t_ns - self._questions[-1][0] > WATCHDOG_ANSWER_NS:
+                self._asked_again_ns = t_ns
             self._questions.append((t_ns, int(message.value(data, "WatchdogQuestion"))))
 
     # ---- what the gateway sends
@@ -271,7 +275,9 @@ class BusOracle:
             self._told_early = None
 
     def _judge_watchdog(self, t_ns: int, answer: int) -> None:
-        live = [question for asked_ns, question in self._questions if t_ns - asked_ns <= WATCHDOG_ANSWER_NS]
+        # A receiver that has lost more needs some good frames until it trusts the next, and may ask for more of them than we do.
+        since_ns = WATCHDOG_ANSWER_NS if t_ns - self._asked_again_ns > _RESYNC_NS else t_ns
+        live = [question for asked_ns, question in self._questions if t_ns - asked_ns <= since_ns]
         live = live or [question for _, question in self._questions][-1:]
         if live and all(answer != ((question << 3 | question >> 5) & 0xFF) ^ 0xA7 for question in live):
             self._violate(t_ns, "watchdog", f"{answer} answers none of {live}")
