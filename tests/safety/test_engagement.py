@@ -8,7 +8,7 @@ import random
 from functools import cache
 
 import pytest
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, Phase, seed, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule, run_state_machine_as_test
 
@@ -18,7 +18,7 @@ from tests.support.campaign import MS, TICK_NS, World
 from tests.support.engagement import CONDITIONS, SETTLED_TICKS, Rules, surroundings_of
 
 SEQUENCES, STEPS = 500, 50
-SEQUENCES_LONG, STEPS_LONG = 20_000, 100
+SEQUENCES_LONG, STEPS_LONG, PARTS = 20_000, 100, 4
 STARTS, STARTS_LONG, START_TICKS = 300, 10_000, 30
 
 
@@ -125,9 +125,10 @@ class Engagement(RuleBasedStateMachine):
             self.go()
 
 
-def run(sequences, steps):
-    run_state_machine_as_test(Engagement, settings=settings(
-        max_examples=sequences, stateful_step_count=steps, deadline=None, database=None, derandomize=True, print_blob=False,
+def run(sequences, steps, part=0):
+    machine = seed(part)(type("Engagement", (Engagement,), {}))
+    run_state_machine_as_test(machine, settings=settings(
+        max_examples=sequences, stateful_step_count=steps, deadline=None, database=None, print_blob=False,
         suppress_health_check=list(HealthCheck), phases=[Phase.generate, Phase.shrink],
     ))
 
@@ -170,6 +171,7 @@ def test_the_rules_of_engagement_hold(figure):
 @pytest.mark.long
 @pytest.mark.timeout(10_800)
 @pytest.mark.req("E1", "E2", "E3", "E4", "G1")
-def test_the_rules_of_engagement_hold_for_long(figure):
-    run(SEQUENCES_LONG, STEPS_LONG)
-    figure(f"E1 to E4: {SEQUENCES_LONG} sequences of {STEPS_LONG} steps, 0 violations")
+@pytest.mark.parametrize("part", range(1, PARTS + 1))
+def test_the_rules_of_engagement_hold_for_long(part, figure):
+    run(SEQUENCES_LONG // PARTS, STEPS_LONG, part)
+    figure(f"E1 to E4: {SEQUENCES_LONG // PARTS} sequences of {STEPS_LONG} steps, part {part} of {PARTS}, 0 violations")
