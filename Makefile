@@ -36,7 +36,7 @@ coverage: setup $(VENV)/dev.stamp
 	$(BIN)/coverage run --include=$(call MUTMUT,only_mutate,$(comma)) -m pytest $(call MUTMUT,pytest_add_cli_args_test_selection, )
 	$(BIN)/coverage report
 
-# Takes about ten minutes. mutmut keeps what has not changed in mutants/, but does not see all that has.
+# Takes a quarter of an hour on a quiet machine. mutmut keeps what has not changed in mutants/, but does not see all that has.
 mutation: setup $(VENV)/dev.stamp
 	rm -rf mutants
 	PATH="$(CURDIR)/$(BIN):$$PATH" mutmut run

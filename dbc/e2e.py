@@ -158,7 +158,7 @@ class E2EWindow:
         timeout_ns: age from which the message is missing [ns]; a stream with such a gap between two good frames is not clean.
     """
 
-    def __init__(self, timeout_ns: int, rules: WindowRules = WindowRules()) -> None:
+    def __init__(self, timeout_ns: int, rules: WindowRules) -> None:
         self._timeout_ns = timeout_ns
         self._rules = rules
         self._mask = (1 << rules.size) - 1

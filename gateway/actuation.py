@@ -114,7 +114,7 @@ class Actuation:
 
     def pass_time(self, elapsed_ns: int) -> None:
         """Tell how long the last demand has stood [ns], for the rates; of more than a tick a tick counts, until told otherwise."""
-        self._tick_s = clamp(elapsed_ns, self._tick_ns // 10, self._tick_ns) * 1e-9
+        self._tick_s = clamp(elapsed_ns, self._tick_ns / 10, self._tick_ns) * 1e-9
 
     def release(self) -> None:
         """Ask for nothing."""

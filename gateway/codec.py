@@ -8,7 +8,7 @@ from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
-from gateway.limits import Demand, clamp
+from gateway.limits import Demand
 from gateway.messages import Mode
 from gateway.modes import DRIVING
 
@@ -108,7 +108,7 @@ class Monitors:
     Args:
         bus_load_norm, cpu_load_norm: see `conditions.Surroundings`.
         rejected: frames that were not taken.
-        tx_error_count: of the CAN controllers, the largest; -1 where none tells.
+        tx_error_count: of the CAN controllers, the largest; 0 or less where none tells.
         finding: why the last engagement ended; None when none has.
     """
 
@@ -211,7 +211,7 @@ class Codec:
                 "MaxSpeed": limits.max_speed_mps / _MPS_PER_KMH,
                 "NavigationValid": cycle.is_navigation_valid,
                 "TrajectoryValid": mode is Mode.ENGAGED,
-                "CommandAge": clamp(cycle.command_age_ms, 0.0, 255.0),
+                "CommandAge": cycle.command_age_ms,
                 "MeasurementId": cycle.measurement_id,
             },
             "SR_Command": {
@@ -231,14 +231,13 @@ class Codec:
         finding = monitors.finding
         status: dict[str, float] = {"Mode": self._mode_codes[monitors.mode]}
         if finding is not None:
-            found = {"Cause": self._cause_codes[finding.cause], "Value": finding.value, "Limit": finding.limit}
-            status |= {name: clamp(value, *self._catalogue.bounds("GW_Status", name)) for name, value in found.items()}
+            status |= {"Cause": self._cause_codes[finding.cause], "Value": finding.value, "Limit": finding.limit}
         heartbeat = {
             "UpTime": monitors.uptime_s,
             "BusLoad": 100.0 * min(monitors.bus_load_norm, 1.0),
             "CpuLoad": 100.0 * min(monitors.cpu_load_norm, 1.0),
-            "RxErrorCount": min(monitors.rejected, 255),
-            "TxErrorCount": clamp(monitors.tx_error_count, 0, 255),
+            "RxErrorCount": monitors.rejected,
+            "TxErrorCount": monitors.tx_error_count,
         }
         return [self._frame("GW_Heartbeat", heartbeat, now_ns), self._frame("GW_Status", status, now_ns)]
 

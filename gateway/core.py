@@ -91,7 +91,7 @@ class GatewayCore:
         self._plausibility = Plausibility(vehicle, is_on_lift=not profile.are_wheels_on_the_road)
         self._gate = TransmitGate(catalogue)
         self._safe_stop: SafeStop | None = None
-        self._start_ns = 0
+        self._start_ns: int | None = None
         self._last_step_ns: int | None = None
         self._good_since_ns: int | None = None
         self._state_time_ns = 0
@@ -222,12 +222,9 @@ class GatewayCore:
 
     def _blockers(self, situation: Situation) -> list[str]:
         blocked = blockers(situation, self.findings)
-        if blocked:
-            self._good_since_ns = None
-        elif self._good_since_ns is None:
-            self._good_since_ns = situation.now_ns
-        good_ns = 0 if self._good_since_ns is None else situation.now_ns - self._good_since_ns
-        return blocked + settling(good_ns, self.commands.good_in_a_row)
+        since_ns = situation.now_ns if blocked or self._good_since_ns is None else self._good_since_ns
+        self._good_since_ns = None if blocked else since_ns
+        return blocked + settling(situation.now_ns - since_ns, self.commands.good_in_a_row)
 
     def _refusals(self, request: OperatorRequest, situation: Situation, last_ns: int) -> list[str]:
         """Why a request is not granted; empty when it is. It is looked at once: all who ask share one clock."""
@@ -317,11 +314,11 @@ class GatewayCore:
         if self.ticks % self._monitor_ticks == 0:
             finding = None if self.disengagement is None else self.disengagement.finding
             monitors = Monitors(
-                uptime_s=(now_ns - self._start_ns) * 1e-9,
+                uptime_s=(now_ns - (self._start_ns or now_ns)) * 1e-9,
                 bus_load_norm=surroundings.bus_load_norm,
                 cpu_load_norm=surroundings.cpu_load_norm,
                 rejected=self.supervisor.rejected.total(),
-                tx_error_count=max((link.tx_error_count for link in surroundings.links.values()), default=-1),
+                tx_error_count=max((link.tx_error_count for link in surroundings.links.values()), default=0),
                 mode=self.mode,
                 finding=finding,
             )

@@ -39,7 +39,7 @@ class Pacer:
     def command_arrived(self, now_ns: int) -> None:
         """Tell of a command. One that is too early waits for the deadline: to be answered a little sooner would use up the credit."""
         self._last_command_ns = now_ns
-        self._is_pulled |= now_ns >= self.deadline_ns - min(self._credit_ns, PULL_NS)
+        self._is_pulled = now_ns >= self.deadline_ns - min(self._credit_ns, PULL_NS)
 
     def is_due(self, now_ns: int) -> bool:
         """Whether to step now."""

@@ -93,9 +93,8 @@ class Flow:
     def note_good(self, spec: MessageSpec, t_ns: int) -> None:
         """Count a good frame that arrived at `t_ns`."""
         self._good += spec.name in self._names
-        if t_ns > self._last_ns:  # of two buses, one is read after the other
-            self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
-            self._last_ns = t_ns
+        self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
+        self._last_ns = max(t_ns, self._last_ns)  # of two buses, one is read after the other
 
     def finding(self, now_ns: int) -> Finding | None:
         """Whether too many were lost within the last `FLOW_WINDOW_NS`."""

@@ -4,6 +4,7 @@ Printed at the end of every run. A mark with an unknown id is an error; an id wi
 With pytest-xdist the processes of the run collect and run the tests, and the one that started them adds up what they say.
 """
 
+import os
 import re
 import tempfile
 from collections import Counter, defaultdict
@@ -84,6 +85,9 @@ class Run:
                     self._node_ids[identifier].add(item.nodeid)
         # A process of `--dist worksteal` without work takes tests from the end of another's: the first and the last of all stay together.
         items.sort(key=lambda item: (item.get_closest_marker("realtime") is not None, item.get_closest_marker("shared_setup") is None))
+        # A change of a module fails its own tests, most of the time: mutmut stops at the first that fails.
+        mutated, _, _ = os.environ.get("MUTANT_UNDER_TEST", "").rpartition(".")
+        items.sort(key=lambda item: item.path.stem != f"test_{mutated.rpartition('.')[2]}")
 
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Iterator[Any]:

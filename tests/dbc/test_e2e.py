@@ -196,28 +196,28 @@ def states(window, frames, period_ns=10 * MS, start_ns=0):
     ],
 )
 def test_window(frames, expected):
-    assert states(E2EWindow(50 * MS), frames) == expected
+    assert states(E2EWindow(50 * MS, WindowRules()), frames) == expected
 
 
 @pytest.mark.req("F7")
 def test_an_invalid_stream_recovers_after_one_clean_second():
     # The last bad frame comes at 50 ms, the first clean one at 60 ms: a second later is the frame after 101 clean ones.
-    assert states(E2EWindow(50 * MS), "...xxx" + 105 * ".") == "??vvvi" + 100 * "i" + 5 * "v"
-    assert states(E2EWindow(50 * MS), "...xxx" + 99 * "." + "x" + 102 * ".") == "??vvvi" + 200 * "i" + 2 * "v"
+    assert states(E2EWindow(50 * MS, WindowRules()), "...xxx" + 105 * ".") == "??vvvi" + 100 * "i" + 5 * "v"
+    assert states(E2EWindow(50 * MS, WindowRules()), "...xxx" + 99 * "." + "x" + 102 * ".") == "??vvvi" + 200 * "i" + 2 * "v"
 
 
 @pytest.mark.parametrize(("gap", "is_clean"), [(4, True), (5, False)])
 def test_a_gap_longer_than_the_timeout_is_not_clean(gap, is_clean):
     """Between the good frames around four that do not come are 50 ms, which is the timeout."""
-    after = states(E2EWindow(50 * MS), "...xxx" + 50 * "." + gap * "-" + 150 * ".")[6:]
+    after = states(E2EWindow(50 * MS, WindowRules()), "...xxx" + 50 * "." + gap * "-" + 150 * ".")[6:]
     # Clean since the first good frame, or since the one after the gap.
     assert after.index("v") == (100 if is_clean else 50 + gap + 100)
 
 
 def test_a_gap_alone_makes_no_stream_invalid_and_a_new_stream_begins_again():
-    assert states(E2EWindow(50 * MS), "..." + 50 * "-" + ".") == "??v" + 50 * "v" + "v"
-    assert states(E2EWindow(50 * MS), ".." + 5 * "-" + "...") == "??" + 5 * "?" + "??v"
-    assert states(E2EWindow(50 * MS), ".." + 4 * "-" + ".") == "??" + 4 * "?" + "v"
+    assert states(E2EWindow(50 * MS, WindowRules()), "..." + 50 * "-" + ".") == "??v" + 50 * "v" + "v"
+    assert states(E2EWindow(50 * MS, WindowRules()), ".." + 5 * "-" + "...") == "??" + 5 * "?" + "??v"
+    assert states(E2EWindow(50 * MS, WindowRules()), ".." + 4 * "-" + ".") == "??" + 4 * "?" + "v"
 
 
 def test_a_slow_stream_needs_a_clean_window_as_well():
@@ -235,7 +235,7 @@ def test_recovery_needs_several_frames_however_long_it_takes():
 
 
 def test_first_frame_long_after_the_start_of_the_clock():
-    assert states(E2EWindow(50 * MS), "...xxx" + 101 * ".", start_ns=10**15) == "??vvvi" + 100 * "i" + "v"
+    assert states(E2EWindow(50 * MS, WindowRules()), "...xxx" + 101 * ".", start_ns=10**15) == "??vvvi" + 100 * "i" + "v"
 
 
 def test_default_rules_are_those_of_the_requirement():

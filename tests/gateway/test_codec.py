@@ -63,6 +63,26 @@ def test_a_dbc_whose_demands_do_not_reach_neutral_is_refused(tmp_path):
         Codec(load([site, GNSS_IMU_DBC]), LIMITS)
 
 
+@pytest.mark.parametrize("codes", ["Mode : 0|4@1+ (1,0) [0|5]", "Mode : 0|4@1+ (1,0) [1|15]"])
+def test_a_dbc_whose_status_has_no_room_for_a_mode_is_refused(tmp_path, codes):
+    site = tmp_path / "site.dbc"
+    text = ROBOTS_DBC.read_text()
+    assert "Mode : 0|4@1+ (1,0) [0|15]" in text
+    site.write_text(text.replace("Mode : 0|4@1+ (1,0) [0|15]", codes))
+    with pytest.raises(CatalogueError, match=r"GW_Status\.Mode"):
+        Codec(load([site, GNSS_IMU_DBC]), LIMITS)
+
+
+def test_a_demand_beyond_the_range_of_a_site_becomes_the_nearest_in_it(tmp_path):
+    site = tmp_path / "site.dbc"
+    site.write_text(ROBOTS_DBC.read_text().replace("(0.05,0) [-1080|1080] \"deg\" SR,RC", "(0.05,0) [-90|90] \"deg\" SR,RC"))
+    catalogue = load([site, GNSS_IMU_DBC])
+    narrow = Codec(catalogue, LIMITS)
+    for wheel_rad, wheel_deg in ((math.pi, 90.0), (-math.pi, -90.0), (math.pi / 4.0, 45.0)):
+        _, steering, *_ = narrow.encode(0, Mode.ENGAGED, replace(DEMAND, steering_wheel_rad=wheel_rad), CYCLE)
+        assert catalogue.decode(catalogue.by_name["SR_Command"], steering)["AngleCommand"] == pytest.approx(wheel_deg)
+
+
 def codec():
     return Codec(CATALOGUE, LIMITS)
 

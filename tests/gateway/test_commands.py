@@ -111,6 +111,17 @@ def test_the_first_sender_stays_the_only_one_until_the_gate_is_reset():
     assert gate.rejected == {"second sender": 3}
 
 
+def test_a_sender_who_has_gone_leaves_what_he_said_and_no_readiness_for_the_next():
+    gate = gate_with_one()
+    gate.offer(NOW_NS, replace(COMMAND, boot_id=8), STATE_SEQ)
+    gate.offer(NOW_NS, replace(COMMAND, seq=2), STATE_SEQ)
+    gate.release()
+    assert (gate.newest.boot_id, gate.age_ns(NOW_NS + 9), gate.status) == (7, 9, CommandStatus.OK)
+    assert (gate.strangers, gate.good_in_a_row) == (0, 0)
+    assert gate.offer(NOW_NS, replace(COMMAND, boot_id=8, seq=0), STATE_SEQ)
+    assert gate.good_in_a_row == 1
+
+
 def test_another_sender_may_begin_with_any_number_after_a_reset():
     gate = gate_with_one()
     gate.reset()

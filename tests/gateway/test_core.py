@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 
 from dbc.frame import CanFrame
 from dbc.health import LinkHealth
+from dbc.vehicle import load_vehicle
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
 from gateway.conditions import Surroundings
-from gateway.core import ENGAGE_GRACE_NS, TICK_NS
+from gateway.core import ENGAGE_GRACE_NS, TICK_NS, GatewayCore
+from gateway.limits import LIFTED, PROVING_GROUND
 from gateway.messages import CommandStatus, Mode, Operation
 from tests.support.drive import GatewayDrive
 
@@ -542,6 +544,7 @@ def test_what_bus_monitors_are_told_every_100_ms():
         assert tick % 10 == 0
         assert beat["UpTime"] == pytest.approx((tick - 1) * 0.01, abs=0.051)
         assert beat["RxErrorCount"] == 5
+        assert beat["TxErrorCount"] == 0  # nobody tells one
     assert all(status == {"Mode": 1, "Cause": 0, "Value": 0, "Limit": 0} for status in heard(drive, "GW_Status", 20).values())
 
 
@@ -673,6 +676,32 @@ def test_a_robot_controller_that_asks_no_new_question_is_found_after_100_ms():
     drive.tick(20)
     assert drive.transitions[-1].finding == Finding(Cause.WATCHDOG_SILENT, pytest.approx(110.0), 100.0, "RC")
     assert drive.transitions[-1].t_ns == asked_ns + 110_000_000
+
+
+@pytest.mark.req("F8")
+@pytest.mark.parametrize(("profile", "contradicts"), [(PROVING_GROUND, True), (LIFTED, False)])
+def test_only_on_the_road_have_wheels_and_navigation_to_agree(profile, contradicts):
+    drive = GatewayDrive()
+    drive.core = GatewayCore(drive.catalogue, load_vehicle(), boot_id=1, profile=profile)
+    drive.car.wheel_speed_offset_mps = 20.0
+    drive.tick(100)
+    assert (Cause.SPEED_IMPLAUSIBLE in {finding.cause for finding in drive.core.findings}) is contradicts
+
+
+@pytest.mark.req("G1")
+@pytest.mark.parametrize("elapsed_ms", [10, 6])
+def test_a_step_that_follows_early_changes_the_demand_by_less(elapsed_ms):
+    drive = GatewayDrive()
+    drive.car.is_following, drive.car.vx_mps = True, 0.0
+    drive.steer_rad = 0.0
+    drive.engage()
+    drive.steer_rad = 0.3
+    drive.tick(5)
+    before_deg = drive.car.told["SR_Command"]["AngleCommand"]
+    drive.now_ns += elapsed_ms * 1_000_000 - TICK_NS
+    drive.tick()
+    limit_deg = math.degrees(drive.core.profile.steering_wheel_rate_radps) * elapsed_ms * 1e-3
+    assert drive.car.told["SR_Command"]["AngleCommand"] - before_deg == pytest.approx(limit_deg, abs=0.05)
 
 
 def test_a_clock_that_has_run_for_long_shortens_no_stop():

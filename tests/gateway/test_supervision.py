@@ -221,7 +221,7 @@ def test_the_exact_number_of_losses():
         to_lose = iter(range(lost))
         found = traffic.run(9, lambda k, to_lose=to_lose: k == 0 or next(to_lose, None) is None)
         assert [(f.value, f.limit) for f in found[:1]] == (
-            [(pytest.approx(100 * lost / expected), pytest.approx(100 * limit / expected))] if lost > limit else []
+            [(pytest.approx(100 * lost / expected, rel=1e-9), pytest.approx(100 * limit / expected, rel=1e-9))] if lost > limit else []
         )
         traffic.run(13, lambda _: True)
         assert traffic.run(1, lambda _: True) == []  # what was lost is forgotten after the window
@@ -240,6 +240,30 @@ def test_when_all_the_senders_pause_nothing_is_lost():
         traffic.run(20, lambda _: True)
         assert traffic.run(pause_ticks, lambda _: False) == []
         assert traffic.run(20, lambda _: True) == []
+
+
+def test_the_exact_number_of_losses_beside_a_pause():
+    traffic = Traffic(*FAST)
+    traffic.run(20, lambda _: True)
+    traffic.run(4, lambda k: k == 0)
+    for pause_ticks in range(1, 4):
+        (found,) = traffic.run(1, lambda _: False)
+        expected = len(FAST) * (13 - (pause_ticks - 1))  # 10 ms without a frame are usual
+        arrived = len(FAST) * (13 - 4 - pause_ticks) + 4
+        assert found.value == pytest.approx(100 * (expected - arrived) / expected, rel=1e-9)
+        assert found.limit == pytest.approx(100 * (len(FAST) + MAX_LOST_FRAMES) / expected, rel=1e-9)
+
+
+@pytest.mark.req("F9")
+def test_a_pause_that_is_over_for_long_excuses_no_losses():
+    found = []
+    for pause_ticks in (0, 4):
+        traffic = Traffic(*FAST)
+        traffic.run(20, lambda _: True)
+        traffic.run(pause_ticks, lambda _: False)
+        traffic.run(20, lambda _: True)
+        found.append(traffic.run(5, lambda k: k == 0))
+    assert found[0] == found[1] != []
 
 
 @pytest.mark.req("F9")
