@@ -135,6 +135,7 @@ class Rules:
         self._good_since = -settled_ticks
         self._ready_since = 0
         self._last_sure_ns: dict[str, int] = {}
+        self._driver_ns = -LATE_NS
 
     def switch(self, name: str) -> None:
         """Make a good condition bad or a bad one good."""
@@ -174,6 +175,8 @@ class Rules:
         if self.bad:
             self._good_since = self._tick
             self._last_sure_ns |= {name: world.now_ns for name in self.bad if self._sure(name)}
+        if any(CONDITIONS[name].grade is Grade.DRIVER for name in self.bad):
+            self._driver_ns = world.now_ns
         reply = world.replies[-1] if len(world.replies) > answered else None
         self._judge_change(before, world.mode, operation, reply, is_fresh)
         self._judge_staying(world.mode)
@@ -217,7 +220,7 @@ class Rules:
         elif before in (Mode.SILENT, Mode.STANDBY, Mode.FAULT) or after in (Mode.SILENT, Mode.READY, Mode.ENGAGED):
             self._complain(f"{step} must not be")
         elif before in (Mode.COMFORT_STOP, Mode.SAFE_STOP) and after is Mode.STANDBY:
-            has_driver = any(CONDITIONS[name].grade is Grade.DRIVER for name in self.bad)
+            has_driver = self.world.now_ns - self._driver_ns <= LATE_NS
             if not has_driver and not (operation is Operation.RESET and is_granted and self.world.car.vx_mps <= 0.15):
                 self._complain(f"{step} at {self.world.car.vx_mps:.1f} m/s without driver or reset")
         elif (before, after) == (Mode.SAFE_STOP, Mode.COMFORT_STOP):
