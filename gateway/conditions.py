@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from dbc.health import BusState, LinkHealth
 from gateway.causes import Cause, Finding
 from gateway.codec import Measurement
-from gateway.commands import CommandGate
+from gateway.commands import NEVER_NS, CommandGate
 from gateway.limits import LimitProfile
 from gateway.messages import CommandStatus, Operation, OperatorRequest
 
@@ -187,8 +187,9 @@ def _override(nodes: Sequence[str]) -> Cause:
 
 def _command_findings(s: Situation) -> Judged:
     c = s.commands
-    sender = f"controller ({c.last_cause})" if c.bad_in_a_row else "controller"
     age_ms, limit_ms = min(c.age_ns(s.now_ns) * _MS_PER_NS, 1e6), COMMAND_TIMEOUT_NS * _MS_PER_NS
+    what = c.last_cause if c.bad_in_a_row else "not heard" if c.age_ns(s.now_ns) == NEVER_NS else ""
+    sender = f"controller ({what})" if what else "controller"
     return (
         (c.status is CommandStatus.FAILED, Finding(Cause.COMMAND_FAILED, 1, 0, "controller")),
         (c.degraded_in_a_row > MAX_DEGRADED, Finding(Cause.COMMAND_FAILED, c.degraded_in_a_row, MAX_DEGRADED, "controller (degraded)")),

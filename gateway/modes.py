@@ -9,7 +9,7 @@
     FAULT         the robots cannot be reached or relied on: disarmed
 
 An engagement takes two steps, ARM and ENGAGE, each a request of the operator with preconditions of its own (`conditions`).
-Nothing re-engages by itself: stops and FAULT are left by a reset of the operator, or by a driver who takes the wheel.
+Nothing re-engages by itself: a stop is left by a reset of the operator or by a driver who takes the wheel, FAULT by a reset alone.
 """
 
 from collections.abc import Mapping, Sequence

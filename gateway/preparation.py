@@ -1,7 +1,6 @@
 """All that a gateway works with, read and checked before anything is opened: what `--check` shows and what `run` is given."""
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -13,7 +12,7 @@ from dbc.errors import UserMistake
 from dbc.vehicle import Vehicle, load_vehicle
 from gateway.core import GatewayCore
 from gateway.limits import PROFILES, LimitProfile
-from gateway.record.session import gateway_session
+from gateway.record.session import gateway_session, pinnable, sha256_of_data
 from gateway.recorder import FileOptions, Recorder
 from gateway.rig import Recording, Rig, RigError
 
@@ -27,7 +26,7 @@ class Preparation:
     """One gateway, ready to be started.
 
     Args:
-        hashes: SHA-256 of every file that the rig names, by its name, of the limits and of the whole configuration.
+        hashes: SHA-256 of every file that the rig names, by its name, of the limits and of the whole configuration but for its own hashes.
     """
 
     rig: Rig
@@ -89,15 +88,12 @@ def configuration(rig: Rig) -> dict[str, Any]:
 
 def _hashes(rig: Rig, catalogue: Catalogue, profile: LimitProfile) -> dict[str, str]:
     files = {path.name: _of_file(path) for path in (rig.car.vehicle, rig.car.mapping) if path is not None}
-    return catalogue.sha256 | files | {"limits": _of_data(asdict(profile)), "configuration": _of_data(configuration(rig))}
+    data = {"limits": asdict(profile), "configuration": pinnable(configuration(rig))}
+    return catalogue.sha256 | files | {name: sha256_of_data(content) for name, content in data.items()}
 
 
 def _of_file(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def _of_data(content: object) -> str:
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def _try(read: Callable[[], T], mistakes: list[str]) -> T | None:

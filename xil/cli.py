@@ -164,7 +164,7 @@ def emulator(
     plant: PlantOption = DEFAULT_PLANT,
     is_lifted: LiftedOption = False,
     seed: Annotated[int, typer.Option(min=0)] = 1,
-    faults: Annotated[Path | None, typer.Option("--faults", help="TOML file with [[faults]] to inject; a scenario is one")] = None,
+    faults: Annotated[Path | None, typer.Option("--faults", help="TOML file with a table of faults to inject; a scenario is one")] = None,
     dbc: DbcOption = DBC_FILES,
     vehicle: VehicleOption = FOCUS,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,

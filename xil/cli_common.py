@@ -83,9 +83,11 @@ def as_json_text(content: object) -> str:
 
 
 def show(content: object, as_json: bool) -> None:
-    """Print a table for people, or with `as_json` an object for programs."""
+    """Print a text or a table for people, or with `as_json` an object for programs."""
     if as_json:
         print(as_json_text(content))
+    elif isinstance(content, str):
+        print(content)  # as it is: names of others may look like markup
     else:
         from rich.console import Console  # noqa: PLC0415
 

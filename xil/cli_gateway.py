@@ -33,7 +33,7 @@ def gateway(
     dbc: DbcOption = DBC_FILES,
     mapping: Annotated[Path | None, typer.Option("--mapping", help="TOML file of the names that the site's DBC has for ours")] = None,
     vehicle: VehicleOption = FOCUS,
-    profile: Annotated[str, typer.Option("--profile", help="limit profile")] = "proving_ground",
+    profile: Annotated[str, typer.Option("--profile", help="limit profile: nominal, proving_ground, lifted or bench")] = "proving_ground",
     control: ControlOption = None,
     key: KeyOption = None,
     record: Annotated[Path | None, typer.Option("--record", help="directory for what `xilgate resim` needs; default: no record")] = None,

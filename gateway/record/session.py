@@ -2,6 +2,7 @@
 
 import hashlib
 import importlib.metadata
+import json
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
@@ -9,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypedDict
 
-from gateway.journal import GatewaySession, pack_value
+from gateway.journal import GatewaySession
 from gateway.limits import LimitProfile
 
 _EARLIEST_NS = 946_684_800_000_000_000
@@ -38,6 +39,20 @@ def origin(boot_id: int, decided_by: Mapping[str, bytes]) -> Origin:
     )
 
 
+def sha256_of_data(content: object) -> str:
+    """Of what JSON can carry."""
+    return hashlib.sha256(_as_json(content)).hexdigest()
+
+
+def pinnable(configuration: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration without the hashes that it expects, one of which may be its own."""
+    return {name: value for name, value in configuration.items() if name != "hashes"}
+
+
+def _as_json(content: object) -> bytes:
+    return json.dumps(content, sort_keys=True).encode()
+
+
 def gateway_session(
     boot_id: int,
     profile: LimitProfile,
@@ -57,7 +72,7 @@ def gateway_session(
     """
     dbc = {path.name: path.read_bytes() for path in dbc_paths}
     limits, vehicle = asdict(profile), vehicle_path.read_bytes()
-    decided_by = dbc | {"vehicle": vehicle, "limits": pack_value(limits), "configuration": pack_value(configuration)}
+    decided_by = dbc | {"vehicle": vehicle, "limits": _as_json(limits), "configuration": _as_json(pinnable(configuration))}
     if mapping_path is not None:
         decided_by["mapping"] = mapping_path.read_bytes()
     return GatewaySession(

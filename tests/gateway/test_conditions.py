@@ -151,7 +151,7 @@ def test_the_robots_own_words_are_more_precise_than_the_supervisors():
 
 def test_an_age_that_never_began_is_told_as_a_number_that_people_can_read():
     (lost,) = [finding for finding in found(situation(commands=CommandGate())) if finding.cause is Cause.COMMAND_LOST]
-    assert lost.value == 1e6
+    assert (lost.value, lost.source) == (1e6, "controller (not heard)")
 
 
 def test_what_was_observed_is_passed_on_once_what_concerns_the_state_as_such():

@@ -117,6 +117,7 @@ def test_example_lies_where_the_unit_and_the_other_files_say():
     tmpfiles = (TARGET / "xilgate.tmpfiles.conf").read_text()
     assert f"d {example.recorder.directory} 0750 xilgate xilgate" in tmpfiles
     assert "z /etc/xilgate/rig.key 0640 root xilgate" in tmpfiles
+    assert f"d {example.control.directory} 0750 xilgate xilgate" in tmpfiles  # `--check` looks for it before any unit has run
     assert example.realtime.priority <= int(SERVICE["LimitRTPRIO"][0])
     assert str(example.metrics.port) in (ROOT / "docs" / "target.md").read_text()
 

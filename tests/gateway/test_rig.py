@@ -15,6 +15,7 @@ from dbc.vehicle import FOCUS
 from gateway import check
 from gateway.limits import PROFILES
 from gateway.preparation import configuration, prepare
+from gateway.record.session import gateway_session
 from gateway.rig import Rig, RigError, make_rig, read_rig
 
 EXAMPLE = Path(__file__).parents[2] / "gateway" / "target" / "rig.toml"
@@ -169,7 +170,7 @@ def test_a_dbc_without_the_messages_that_the_gateway_needs(rig_file):
 @pytest.mark.req("S5")
 def test_hashes_pin_files_and_limits(rig_file):
     found = prepare(read_rig(rig_file(SMALLEST))).hashes
-    pinned = with_hashes(*(f'"{name}" = "{found[name]}"' for name in ("robots.dbc", "focus.toml", "limits")))
+    pinned = with_hashes(*(f'"{name}" = "{found[name]}"' for name in ("robots.dbc", "focus.toml", "limits", "configuration")))
     assert prepare(read_rig(rig_file(pinned))).hashes["limits"] == found["limits"]
     other = "0" * 64
     with pytest.raises(RigError) as caught:
@@ -182,6 +183,16 @@ def test_hashes_pin_files_and_limits(rig_file):
 
 
 @pytest.mark.req("S5")
+def test_a_record_has_the_hashes_that_were_pinned(rig_file):
+    preparation = prepare(read_rig(rig_file(SMALLEST)))
+    found, rig = preparation.hashes, preparation.rig
+    pinned = prepare(read_rig(rig_file(with_hashes(f'configuration = "{found["configuration"]}"')))).rig
+    session = gateway_session(1, preparation.profile, rig.car.dbc, rig.car.vehicle, configuration(pinned))
+    for name in ("limits", "configuration", "robots.dbc"):
+        assert session.sha256[name] == found[name]
+    assert session.sha256["vehicle"] == found["focus.toml"]
+
+
 def test_hashes_follow_what_they_stand_for(rig_file, tmp_path):
     base = prepare(read_rig(rig_file(SMALLEST))).hashes
     (tmp_path / "focus.toml").write_text(FOCUS.read_text() + "\n# another file\n")

@@ -10,6 +10,7 @@ import pytest
 
 from dbc.catalogue import ROBOTS_DBC
 from tests.support.processes import free_base_port, start_xilgate, wait_until, xilgate
+from xil.cli_common import show
 from xil.scenario import scenario_path
 
 
@@ -173,3 +174,9 @@ def test_bench_gateway_prints_the_common_shape():
     assert {"solver", "set", "instances", "rounds", "quiet_mean_us", "quiet_p99_us", "raw_p99_us", "raw_max_us"} <= row.keys()
     assert row["instances"] >= 100
     assert 0.0 < row["quiet_mean_us"] <= row["raw_max_us"]
+
+
+def test_a_text_is_printed_as_it_is(capsys):
+    for text in ("car [/a] x", "/data/[red]/robots.dbc", "x" * 300):
+        show(text, as_json=False)
+        assert capsys.readouterr().out == text + "\n"
