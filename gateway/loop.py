@@ -11,6 +11,8 @@ BUCKETS_NS = tuple(bound_us * 1_000 for bound_us in (20, 50, 100, 200, 500, 1_00
 
 SPACING_NS = 700_000
 """Shortest time from a wake-up to the next one for frames [ns]: 2,000 of them a second, or a flood, must not mean as many wake-ups."""
+SHORTEST_NS = 200_000
+"""Shortest time between any two wake-ups [ns]: a controller that sends without end must not take the processor."""
 LONGEST_NS = 5_000_000
 """Longest sleep [ns]: what is not waited for has a time of arrival that is no more than this late."""
 
@@ -60,7 +62,7 @@ class ArrivalWait:
 
     Args:
         frames: gives the descriptors of what comes many times, each time anew; those that are not usable are left out for that time.
-        command: a descriptor of what comes rarely, and must not wait at all.
+        command: a descriptor of what comes rarely, and must hardly wait.
     """
 
     def __init__(self, frames: Callable[[], list[int]], command: int) -> None:
@@ -71,6 +73,7 @@ class ArrivalWait:
     def wait(self, deadline_ns: int) -> int:
         """The monotonic time of the wake-up [ns]: `LONGEST_NS` after the one before at most, for frames `SPACING_NS` at least."""
         deadline_ns = min(deadline_ns, self._last_ns + LONGEST_NS)
+        self._sleep([], min(self._last_ns + SHORTEST_NS, deadline_ns))
         if not self._sleep([self._command], min(self._last_ns + SPACING_NS, deadline_ns)):
             self._sleep([*self._frames(), self._command], deadline_ns)
         self._last_ns = time.monotonic_ns()
