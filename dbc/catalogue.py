@@ -131,6 +131,11 @@ class Catalogue:
             math.inf if found.maximum is None else float(found.maximum),
         )
 
+    def resolution(self, name: str, signal: str) -> float:
+        """Smallest step of a signal, in the unit of the DBC; 0 for one in floating point."""
+        found = self._messages[name].get_signal_by_name(signal)
+        return 0.0 if found.is_float else abs(float(found.scale))
+
     def enumeration(self, name: str, signal: str) -> dict[str, int]:
         """Value table of a signal: entry name to raw value."""
         choices: Mapping[int, object] = self._messages[name].get_signal_by_name(signal).choices or {}

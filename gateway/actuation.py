@@ -79,17 +79,17 @@ class Actuation:
         last_limited: the newest activation of each limit.
     """
 
-    def __init__(self, vehicle: Vehicle, profile: LimitProfile, tick_ns: int, resolution: Resolution | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, profile: LimitProfile, tick_ns: int, resolution: Resolution) -> None:
         self._vehicle = vehicle
         self._profile = profile
         self._tick_ns = tick_ns
         self._tick_s = tick_ns * 1e-9
-        self._resolution = resolution or Resolution()
+        self._resolution = resolution
         self._wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
         self._full_drive_mps2 = vehicle.pedals.full_drive_force_n / vehicle.model.mass_kg
         self._full_brake_mps2 = vehicle.pedals.full_brake_force_n / vehicle.model.mass_kg
-        self._drive_step_mps2 = self._resolution.pedal_norm * self._full_drive_mps2
-        self._brake_step_mps2 = self._resolution.pedal_norm * self._full_brake_mps2
+        self._drive_step_mps2 = resolution.accelerator_norm * self._full_drive_mps2
+        self._brake_step_mps2 = resolution.brake_norm * self._full_brake_mps2
         self._behind: Counter[str] = Counter()
         self.demand = NEUTRAL
         self.held_back: set[str] = set()
@@ -225,8 +225,8 @@ class Actuation:
         drive_mps2, lowest_mps2, highest_mps2 = (max(value, 0.0) for value in (acceleration_mps2, low_mps2, high_mps2))
         brake_mps2, weakest_mps2, firmest_mps2 = (max(-value, 0.0) for value in (acceleration_mps2, high_mps2, low_mps2))
         return (
-            steps_within(drive_mps2, lowest_mps2, highest_mps2, self._drive_step_mps2) * self._resolution.pedal_norm,
-            steps_within(brake_mps2, weakest_mps2, firmest_mps2, self._brake_step_mps2) * self._resolution.pedal_norm,
+            steps_within(drive_mps2, lowest_mps2, highest_mps2, self._drive_step_mps2) * self._resolution.accelerator_norm,
+            steps_within(brake_mps2, weakest_mps2, firmest_mps2, self._brake_step_mps2) * self._resolution.brake_norm,
         )
 
     def _note(self, name: str, asked: float, limit: float, given: float) -> None:

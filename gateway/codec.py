@@ -8,7 +8,7 @@ from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
-from gateway.limits import Demand
+from gateway.limits import COARSEST, Demand, Resolution
 from gateway.messages import Mode
 from gateway.modes import DRIVING
 
@@ -122,7 +122,14 @@ class Monitors:
 
 
 class Codec:
-    """Decodes measurements and encodes demands by the catalogue."""
+    """Decodes measurements and encodes demands by the catalogue.
+
+    Attributes:
+        resolution: of the demands.
+
+    Raises:
+        CatalogueError: the catalogue is not what the gateway needs; one line says what it lacks.
+    """
 
     def __init__(self, catalogue: Catalogue, limits: RobotLimits) -> None:
         catalogue.require(NEEDED_MESSAGES + COMMAND_MESSAGES + MONITOR_MESSAGES, "gateway")
@@ -135,6 +142,7 @@ class Codec:
         try:
             self._read_tables()
             self._rehearse()
+            self.resolution = self._resolution()
         except (KeyError, EncodeError) as error:
             raise CatalogueError(f"{', '.join(catalogue.sha256)}: not what the gateway needs: {error}") from error
         self._robots.clear()
@@ -163,6 +171,16 @@ class Codec:
         for mode in Mode:
             self.encode(_REHEARSAL_NS, mode, _REHEARSED_DEMAND, _REHEARSED_CYCLE)
             self.encode_monitors(_REHEARSAL_NS, replace(_REHEARSED_MONITORS, mode=mode))
+
+    def _resolution(self) -> Resolution:
+        steps: dict[str, float] = {}
+        for demand, (name, signal, unit) in _DEMANDS.items():
+            step, coarsest = self._catalogue.resolution(name, signal), getattr(COARSEST, demand) / unit
+            if step > coarsest:
+                raise EncodeError(f"{name}.{signal}: steps of {step:.4g}, allowed: up to {coarsest:.4g}")
+            if step:  # in floating point our own are fine enough
+                steps[demand] = step * unit
+        return Resolution(**steps)
 
     def update(self, measurement: Measurement, values: dict[str, dict[str, float]]) -> None:
         """Take the newest values of each message into the measurement."""
@@ -247,6 +265,13 @@ class Codec:
             payload = protector.protect(payload)
         return CanFrame(self._catalogue.by_name[name].arbitration_id, payload, now_ns)
 
+
+_DEMANDS = {
+    "steering_wheel_rad": ("SR_Command", "AngleCommand", math.radians(1.0)),
+    "accelerator_norm": ("AR_Command", "PositionCommand", 0.01),
+    "brake_norm": ("BR_Command", "PositionCommand", 0.01),
+}
+"""The signal of each demand, and its unit in SI."""
 
 _REHEARSAL_NS = 0
 _REHEARSED_DEMAND = Demand(0.0, 0.0, 0.0)

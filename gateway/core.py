@@ -108,7 +108,7 @@ class GatewayCore:
         self.supervisor = Supervisor(catalogue, NEEDED_MESSAGES)
         self.commands = CommandGate()
         self.latency = LatencyChain()
-        self.actuation = Actuation(vehicle, profile, TICK_NS)
+        self.actuation = Actuation(vehicle, profile, TICK_NS, self._codec.resolution)
         self.measurement = Measurement()
         self.findings: list[Finding] = []
         self.blockers: list[str] = []

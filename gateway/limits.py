@@ -130,7 +130,12 @@ class Resolution:
     """
 
     steering_wheel_rad: float = math.radians(0.05)
-    pedal_norm: float = 1e-4
+    accelerator_norm: float = 1e-4
+    brake_norm: float = 1e-4
+
+
+COARSEST = Resolution(steering_wheel_rad=math.radians(0.5), accelerator_norm=5e-3, brake_norm=5e-3)
+"""A step must be less than what the slowest rate of a profile allows in a tick, that of `bench`: 1 degree, 0.6 %, 2 %."""
 
 
 @dataclass(frozen=True, slots=True)

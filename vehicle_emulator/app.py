@@ -43,6 +43,7 @@ class EmulatorOptions:
         buses: bus of every network as `dbc.link` wants it, for example "socketcan:vcan0".
         vehicle: vehicle file; None for the car that comes with the project.
         dbc: DBC files of robots and navigation system.
+        mapping: names that the site gives to messages and signals, see `dbc.mapping`; None where they are ours.
         road: road file, as `vehicle_emulator.road` has it; None for a level one.
         plant: one of `plants.CHOICES`.
         is_lifted: whether the car begins on the lift.
@@ -52,6 +53,7 @@ class EmulatorOptions:
     buses: Mapping[str, str]
     vehicle: Path | None = None
     dbc: tuple[Path, ...] = (dbc_catalogue.ROBOTS_DBC, dbc_catalogue.GNSS_IMU_DBC)
+    mapping: Path | None = None
     start: StartPose = field(default_factory=StartPose)
     road: Path | None = None
     plant: str = DEFAULT_PLANT
@@ -110,7 +112,7 @@ def run(options: EmulatorOptions, stop: threading.Event) -> None:
     Raises:
         UserMistake, SetupFailure: the set-up does not work; one line says why.
     """
-    catalogue = dbc_catalogue.load(options.dbc)
+    catalogue = dbc_catalogue.load(options.dbc, options.mapping)
     setup = EmulatorSetup(
         vehicle=load_vehicle(options.vehicle or FOCUS),
         start=options.start,

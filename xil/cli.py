@@ -23,6 +23,7 @@ from xil.cli_common import (
     DbcOption,
     JsonOption,
     KeyOption,
+    MappingOption,
     PortOption,
     RigOption,
     VehicleOption,
@@ -86,6 +87,7 @@ def drive(
     view: Annotated[bool, typer.Option("--view", help="serve the virtual world while driving")] = False,
     view_port: Annotated[int, typer.Option(min=1024, max=65535, help="port of the page")] = 8080,
     dbc: DbcOption = DBC_FILES,
+    mapping: MappingOption = None,
     vehicle: VehicleOption = FOCUS,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
 ) -> None:
@@ -104,6 +106,7 @@ def drive(
         out=out or Path("runs") / f"{Path(scenario).stem}-{stage.value}",
         view_port=view_port if view else None,
         dbc_paths=tuple(dbc),
+        mapping_path=mapping,
         vehicle_path=vehicle,
         telemetry_base_port=telemetry_port,
     )
@@ -166,6 +169,7 @@ def emulator(
     seed: Annotated[int, typer.Option(min=0)] = 1,
     faults: Annotated[Path | None, typer.Option("--faults", help="TOML file with a table of faults to inject; a scenario is one")] = None,
     dbc: DbcOption = DBC_FILES,
+    mapping: MappingOption = None,
     vehicle: VehicleOption = FOCUS,
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
 ) -> None:
@@ -178,6 +182,7 @@ def emulator(
         lambda m: m.EmulatorOptions(
             buses=bus_names(bus, navigation_bus) if bus else bus_names(f"xilgate:{ROBOTS}", navigation_bus or f"xilgate:{NAVIGATION}"),
             dbc=tuple(dbc),
+            mapping=mapping,
             vehicle=vehicle,
             start=StartPose(x_m, y_m, yaw_rad, speed_mps),
             road=road,

@@ -18,6 +18,7 @@ from dbc.errors import SetupFailure, UserMistake
 EXIT_FAIL, EXIT_USER, EXIT_SETUP, EXIT_INTERRUPTED = 1, 2, 3, 130
 
 DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
+MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML file of the names and units that a site's DBC has for ours")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
 PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
 ControlOption = Annotated[

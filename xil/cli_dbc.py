@@ -8,12 +8,11 @@ import typer
 
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.lint import DEFAULT_MAX_LOAD, Severity
-from xil.cli_common import EXIT_FAIL, JsonOption, show
+from xil.cli_common import EXIT_FAIL, JsonOption, MappingOption, show
 
 tools = typer.Typer(help="Look at DBC files: what is in them, what is wrong with them, what a new version breaks.", no_args_is_help=True)
 
 FilesArgument = Annotated[list[Path], typer.Argument(metavar="[FILES]...", help="DBC files that are used together")]
-MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML file with the names and units of a site")]
 OWN_FILES = [ROBOTS_DBC, GNSS_IMU_DBC]
 
 

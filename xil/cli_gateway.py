@@ -11,7 +11,18 @@ from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import FOCUS
 from gateway.telemetry import DEFAULT_BASE_PORT
-from xil.cli_common import ControlOption, DbcOption, JsonOption, KeyOption, PortOption, VehicleOption, exit_code_of, refuse_beside_rig, show
+from xil.cli_common import (
+    ControlOption,
+    DbcOption,
+    JsonOption,
+    KeyOption,
+    MappingOption,
+    PortOption,
+    VehicleOption,
+    exit_code_of,
+    refuse_beside_rig,
+    show,
+)
 
 if TYPE_CHECKING:
     from gateway.rig import Rig
@@ -31,7 +42,7 @@ def gateway(
     bus: Annotated[str, typer.Option("--bus", help="python-can name of the robots' bus, for example socketcan:can0")] = "socketcan:can0",
     navigation_bus: Annotated[str | None, typer.Option("--navigation-bus", help="that of the navigation system; default: the same")] = None,
     dbc: DbcOption = DBC_FILES,
-    mapping: Annotated[Path | None, typer.Option("--mapping", help="TOML file of the names that the site's DBC has for ours")] = None,
+    mapping: MappingOption = None,
     vehicle: VehicleOption = FOCUS,
     profile: Annotated[str, typer.Option("--profile", help="limit profile: nominal, proving_ground, lifted or bench")] = "proving_ground",
     control: ControlOption = None,

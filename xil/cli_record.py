@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
-from xil.cli_common import EXIT_FAIL, EXIT_INTERRUPTED, EXIT_USER, DbcOption, JsonOption, progress, show, stop_on_signal
+from xil.cli_common import EXIT_FAIL, EXIT_INTERRUPTED, EXIT_USER, DbcOption, JsonOption, MappingOption, progress, show, stop_on_signal
 
 records = typer.Typer()
 
@@ -27,6 +27,7 @@ def replay(
     sender: Annotated[list[str] | None, typer.Option("--sender", help="only messages of this node of the DBC; repeat")] = None,
     with_gateway: Annotated[bool, typer.Option("--with-gateway", help="messages of the gateway too: never where one lives")] = False,
     dbc: DbcOption = _DBC_FILES,
+    mapping: MappingOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Play a bus record back, every frame at its time; without --bus tell what is in it."""
@@ -37,7 +38,7 @@ def replay(
         found = playing.contents(playing.read_record(log))
         show(found if as_json else playing.contents_table(str(log), found), as_json)
         return
-    selection = playing.select(load(dbc), arbitration_id, sender, with_gateway=with_gateway)
+    selection = playing.select(load(dbc, mapping), arbitration_id, sender, with_gateway=with_gateway)
     with stop_on_signal() as stop, playing.open_buses(bus, log) as send:
         player = playing.Player(send, selection, speed, sleep=lambda duration_ns: _wait(stop, duration_ns))
         player.play(playing.read_record(log), stop.is_set)

@@ -52,6 +52,7 @@ class DriveOptions:
         navigation_bus: None for what goes with `bus`.
         solver: name, or None for what the stage stands for.
         view_port: port of the virtual world's page, or None for no page.
+        mapping_path: names of the site for ours, see `dbc.mapping`; None where they are ours.
     """
 
     scenario: str
@@ -65,6 +66,7 @@ class DriveOptions:
     out: Path
     view_port: int | None
     dbc_paths: tuple[Path, ...]
+    mapping_path: Path | None
     vehicle_path: Path
     telemetry_base_port: int
 
@@ -199,7 +201,7 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
     """Work out everything that can be wrong before anything starts."""
     scenario = load_scenario(options.scenario)
     vehicle = load_vehicle(options.vehicle_path)
-    catalogue = load(options.dbc_paths)
+    catalogue = load(options.dbc_paths, options.mapping_path)
     check(scenario.faults, catalogue)
     if scenario.faults and options.stage is Stage.VEHIL:
         raise UserMistake(f"scenario {scenario.name}: its faults are injected into the emulated car; stage vehil drives another")
@@ -220,6 +222,7 @@ def _prepare(options: DriveOptions, display: Display) -> RunSetup:
     setup = RunSetup(
         scenario, options.stage, vehicle, catalogue, solver, library, bus, options.seed, options.out,
         options.dbc_paths, options.vehicle_path, options.view_port, options.telemetry_base_port, options.plant, options.is_lifted,
+        options.mapping_path,
     )  # fmt: skip
     if options.stage is not Stage.VEHIL:
         Emulator(setup.emulator, catalogue, START_NS, display.announce)  # refuses what it cannot emulate, and builds the car
@@ -246,6 +249,7 @@ def _configuration(setup: RunSetup) -> dict[str, object]:
         "is_lifted": setup.is_lifted,
         "bus": dict(setup.bus.names) if setup.bus else "lockstep",
         "dbc": [str(path) for path in setup.dbc_paths],
+        "mapping": None if setup.mapping_path is None else str(setup.mapping_path),
         "vehicle": setup.vehicle.model_dump(),
         "ocp": asdict(OcpOptions(model=DRIVE_MODEL)),
         "limits": asdict(setup.profile),
@@ -254,6 +258,7 @@ def _configuration(setup: RunSetup) -> dict[str, object]:
 
 def _facts(setup: RunSetup, options: DriveOptions, started: datetime, duration_s: float, driven: _Driven) -> RunFacts:
     files = {path.name: path for path in setup.dbc_paths}
+    files |= {} if setup.mapping_path is None else {"mapping": setup.mapping_path}
     files |= {"vehicle": setup.vehicle_path, "scenario": scenario_path(options.scenario), "configuration": setup.configuration}
     if setup.build is not None:
         files["controller library"] = setup.build.library

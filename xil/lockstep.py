@@ -47,7 +47,14 @@ def journals_of(setup: RunSetup) -> Journals:
     """The journals of a run, in its directory, in which the inputs of the run are already."""
     return Journals(
         setup.directory,
-        gateway_session(_GATEWAY_BOOT_ID, setup.profile, setup.dbc_paths, setup.vehicle_path, {"stage": setup.stage.value}),
+        gateway_session(
+            _GATEWAY_BOOT_ID,
+            setup.profile,
+            setup.dbc_paths,
+            setup.vehicle_path,
+            {"stage": setup.stage.value},
+            mapping_path=setup.mapping_path,
+        ),
         controller_session(_CONTROLLER_BOOT_ID, setup.solver, None, setup.reference_csv, setup.vehicle_path),
     )
 

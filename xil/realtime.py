@@ -122,7 +122,9 @@ class RealtimeRun:
             raise ValueError("a real-time stage needs a bus")
         telemetry = ["--telemetry-port", str(setup.telemetry_base_port)]
         vehicle = ["--vehicle", str(setup.vehicle_path)]
-        contract = [*vehicle, *(argument for path in setup.dbc_paths for argument in ("--dbc", str(path))), *telemetry]
+        dbc = [argument for path in setup.dbc_paths for argument in ("--dbc", str(path))]
+        mapping = [] if setup.mapping_path is None else ["--mapping", str(setup.mapping_path)]
+        contract = [*vehicle, *dbc, *mapping, *telemetry]
         sockets = ["--control", str(control.directory)]
         if channels := bus.hub_channels:
             bitrates = [argument for network in channels for argument in ("--bitrate", str(setup.catalogue.bitrate_bps[network]))]

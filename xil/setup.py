@@ -22,6 +22,7 @@ class RunSetup:
         view_port: port of the virtual world's page, or None.
         directory: where the run leaves its files.
         plant, is_lifted: of the emulated car, see `vehicle_emulator.emulator.EmulatorSetup`.
+        mapping_path: names of the site for ours, see `dbc.mapping`; None where they are ours.
     """
 
     scenario: Scenario
@@ -39,6 +40,7 @@ class RunSetup:
     telemetry_base_port: int
     plant: str = DEFAULT_PLANT
     is_lifted: bool = False
+    mapping_path: Path | None = None
 
     @property
     def emulator(self) -> EmulatorSetup:

@@ -6,16 +6,19 @@ Everything is compared in SI units or in those of our DBC. What may differ is th
 import math
 import random
 import tomllib
+from itertools import pairwise
 from typing import NamedTuple
 
 import cantools
 import pytest
 
-from dbc.catalogue import ROBOTS_DBC, DecodeError, EncodeError, load
+from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC, DecodeError, EncodeError, load
 from dbc.e2e import E2EReceiver, E2EStatus
 from dbc.frame import CanFrame
 from dbc.vehicle import load_vehicle
 from gateway.causes import Cause
+from gateway.core import TICK_NS
+from gateway.limits import PROVING_GROUND
 from gateway.messages import Mode, Operation
 from tests.support import drive
 from tests.support.site import SITE_DBC, SITE_MAPPING, load_site
@@ -27,6 +30,8 @@ OUR_LAYOUTS = {message.name: message for message in cantools.database.load_file(
 SITE_LAYOUTS = {message.name: message for message in cantools.database.load_file(str(SITE_DBC)).messages}
 MAPPING = tomllib.loads(SITE_MAPPING.read_text())["messages"]
 NUMBERS = [(name, signal.name) for name in ROBOT_MESSAGES for signal in OUR_LAYOUTS[name].signals if not signal.choices]
+BRAKE_ENCODER_STEP_NORM = 0.0032
+"""What a step of the emulated brake robot's encoder, 0.1 % of the pedal, is as a drive demand."""
 # The steps of the coarser of the two DBCs.
 STEERING_STEP_RAD, STEERING_RATE_STEP_RADPS, PEDAL_STEP_NORM, WHEEL_STEP_RADPS = 0.0009, 0.0176, 0.0001, 0.0105
 
@@ -179,10 +184,33 @@ def test_the_closed_loop_drives_the_same_car(monkeypatch, is_emulated):
         assert (here.mode, here.is_valid, here.frames) == (there.mode, there.is_valid, there.frames)
         # Positions run apart as the rounded demands add up; 0.02 m after 4 s at 20 m/s.
         assert there.state == pytest.approx(here.state, abs=0.02)
-        assert there.demands == pytest.approx(here.demands, abs=3 * STEERING_STEP_RAD)
+        assert there.demands[:4] == pytest.approx(here.demands[:4], abs=3 * STEERING_STEP_RAD)
+        assert there.demands[4] == pytest.approx(here.demands[4], abs=BRAKE_ENCODER_STEP_NORM)
     assert max(abs(cycle.demands[0]) for cycle in site) > 0.1
     assert max(cycle.demands[2] for cycle in site) > 0.02
 """There is something to compare: steering-wheel angle and brake."""
+
+
+@pytest.mark.req("G1")
+def test_rates_hold_on_the_steps_of_the_site(tmp_path, monkeypatch):
+    """Demands that were rounded to our steps would break them by up to half a step of the site."""
+    text, coarse = ROBOTS_DBC.read_text(), tmp_path / "coarse.dbc"
+    coarse.write_text(text.replace('16|16@1- (0.05,0) [-1080|1080] "deg" SR', '16|16@1- (0.45,0) [-1080|1080] "deg" SR'))
+    catalogue = load([coarse, GNSS_IMU_DBC])
+    monkeypatch.setattr(drive, "load", lambda: catalogue)
+    found = drive.GatewayDrive()
+    found.car.is_following = True
+    found.car.speed_mps = 0.0
+    found.engage()
+    angles_deg = [0.0]
+    for tick in range(300):
+        found.steer_rad = math.copysign(0.2, 150 - tick)
+        frames = {frame.arbitration_id: frame for frame in found.tick().output.frames}
+        spec = catalogue.by_name["SR_Command"]
+        angles_deg.append(catalogue.decode(spec, frames[spec.arbitration_id])["AngleCommand"])
+    reach_deg = math.degrees(PROVING_GROUND.steering_wheel_rate_radps) * TICK_NS * 1e-9
+    changes_deg = [abs(after - before) for before, after in pairwise(angles_deg)]
+    assert reach_deg - 0.45 < max(changes_deg) <= reach_deg + 1e-9
 
 
 def test_what_the_robots_say_is_seen_to_within_the_resolution(monkeypatch):

@@ -20,7 +20,7 @@ EPSILON = 1e-9
 
 
 def actuation(profile=NOMINAL, *, steer_rad=0.0, accelerator=0.0, brake=0.0):
-    gate = Actuation(CAR, profile, TICK_NS)
+    gate = Actuation(CAR, profile, TICK_NS, Resolution())
     if steer_rad or accelerator or brake:
         gate.start_from(Demand(steer_rad * CAR.steering.ratio, accelerator, brake))
     return gate
@@ -467,7 +467,7 @@ def test_every_limit_has_a_unit():
 
 
 def test_other_steps_of_the_bus():
-    coarse = Resolution(math.radians(0.5), 0.004)
+    coarse = Resolution(math.radians(0.5), accelerator_norm=0.004, brake_norm=0.003)
     gate = Actuation(CAR, NOMINAL, TICK_NS, coarse)
     for _ in range(200):
         gate.follow(0.05, 1.0, 20.0, 0.0)
@@ -475,6 +475,10 @@ def test_other_steps_of_the_bus():
     assert math.degrees(gate.demand.steering_wheel_rad) == pytest.approx(16.5)  # 3 m/s2 are 16.72 degrees
     assert gate.demand.accelerator_norm == pytest.approx(0.62)  # 2 m/s2 are 62.0 %
     assert gate.acceleration_mps2 <= 2.0
+    for _ in range(100):
+        gate.follow(0.0, -1.0, 20.0, 0.0)
+        assert math.remainder(gate.demand.brake_norm, 0.003) == pytest.approx(0.0, abs=1e-9)
+    assert gate.demand.brake_norm > 0.1
 
 
 # ---- no frame ever breaks a limit
@@ -486,7 +490,7 @@ def test_other_steps_of_the_bus():
 @pytest.mark.parametrize("speed_mps", [0.0, 0.99, 1.0, 3.7, 8.4, 22.2, 36.0])
 def test_five_steps_on_both_sides_of_every_steering_bound(profile, car, speed_mps):
     vehicle = CARS[car]
-    wire, gate = Wire(profile, vehicle), Actuation(vehicle, profile, TICK_NS)
+    wire, gate = Wire(profile, vehicle), Actuation(vehicle, profile, TICK_NS, Resolution())
     step_rad = math.radians(STEP_DEG) / vehicle.steering.ratio
     ends_rad = [profile.steering_wheel_limit_rad / vehicle.steering.ratio, vehicle.steering.road_wheel_limit_rad]
     if speed_mps >= 1.0:
@@ -511,7 +515,7 @@ def test_five_steps_on_both_sides_of_every_steering_bound(profile, car, speed_mp
 @pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
 def test_five_steps_on_both_sides_of_every_pedal_bound(profile, car):
     vehicle = CARS[car]
-    wire, gate = Wire(profile, vehicle), Actuation(vehicle, profile, TICK_NS)
+    wire, gate = Wire(profile, vehicle), Actuation(vehicle, profile, TICK_NS, Resolution())
     low_mps2, high_mps2 = -min(profile.deceleration_mps2, wire.brake_mps2), min(profile.acceleration_mps2, wire.drive_mps2)
     for bound_mps2, step_mps2 in ((high_mps2, wire.drive_mps2 * 1e-4), (low_mps2, wire.brake_mps2 * 1e-4)):
         for k in range(-5, 6):
@@ -542,7 +546,7 @@ sequences = {
 
 
 def drive_and_judge(profile, car, start, asked, hold, then):
-    gate, wire = Actuation(car, profile, TICK_NS), Wire(profile, car)
+    gate, wire = Actuation(car, profile, TICK_NS, Resolution()), Wire(profile, car)
     gate.start_from(Demand(*start))
     before = wire.read(gate.demand)
     for k, (steer_rad, drive_norm, vx_mps, brake_norm) in enumerate(asked):

@@ -1,7 +1,7 @@
 """The codec: what each signal becomes in SI units, what each demand becomes on the bus, and the DBC it is given."""
 
 import math
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 
 import pytest
 
@@ -9,7 +9,7 @@ from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC, CatalogueError, load
 from dbc.e2e import E2EReceiver
 from gateway.causes import Cause, Finding
 from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, RobotLimits
-from gateway.limits import Demand
+from gateway.limits import Demand, Resolution
 from gateway.messages import Mode
 
 LIMITS = RobotLimits(steering_wheel_rate_radps=10.0, max_speed_mps=36.0, pedal_rate_mps=0.5049)
@@ -81,6 +81,43 @@ def test_a_demand_beyond_the_range_of_a_site_becomes_the_nearest_in_it(tmp_path)
     for wheel_rad, wheel_deg in ((math.pi, 90.0), (-math.pi, -90.0), (math.pi / 4.0, 45.0)):
         _, steering, *_ = narrow.encode(0, Mode.ENGAGED, replace(DEMAND, steering_wheel_rad=wheel_rad), CYCLE)
         assert catalogue.decode(catalogue.by_name["SR_Command"], steering)["AngleCommand"] == pytest.approx(wheel_deg)
+
+
+STEPS = {
+    "steering_wheel_rad": ('AngleCommand : 16|16@1- (0.05,0) [-1080|1080] "deg" SR', "(0.05,", "SR_Command.AngleCommand"),
+    "accelerator_norm": ('PositionCommand : 16|16@1+ (0.01,0) [0|100] "%" AR', "(0.01,", "AR_Command.PositionCommand"),
+    "brake_norm": ('PositionCommand : 16|16@1+ (0.01,0) [0|100] "%" BR', "(0.01,", "BR_Command.PositionCommand"),
+}
+
+
+def dbc_with_step(tmp_path, demand, step):
+    line, ours, _ = STEPS[demand]
+    text, site = ROBOTS_DBC.read_text(), tmp_path / "site.dbc"
+    assert line in text
+    site.write_text(text.replace(line, line.replace(ours, f"({step},")))
+    return [site, GNSS_IMU_DBC]
+
+
+def test_demands_have_the_steps_of_the_dbc(tmp_path, monkeypatch):
+    assert Codec(CATALOGUE, LIMITS).resolution == Resolution(math.radians(0.05), 1e-4, 1e-4)
+    for demand, step, expected in (
+        ("steering_wheel_rad", 0.5, math.radians(0.5)),
+        ("steering_wheel_rad", -0.2, math.radians(0.2)),
+        ("accelerator_norm", 0.5, 0.005),
+        ("brake_norm", 0.2, 0.002),
+    ):
+        found = Codec(load(dbc_with_step(tmp_path, demand, step)), LIMITS).resolution
+        assert asdict(found) == pytest.approx(asdict(replace(Resolution(), **{demand: expected})))
+    catalogue = load()
+    monkeypatch.setattr(catalogue, "resolution", lambda name, signal: 0.0)  # all in floating point
+    assert Codec(catalogue, LIMITS).resolution == Resolution()
+
+
+@pytest.mark.parametrize("demand", STEPS)
+def test_a_dbc_whose_steps_are_too_coarse_to_keep_rates_is_refused(tmp_path, demand):
+    files, signal = dbc_with_step(tmp_path, demand, 0.51), STEPS[demand][2]
+    with pytest.raises(CatalogueError, match=rf"^site\.dbc, gnss_imu\.dbc: .* {signal}: steps of 0\.51, allowed: up to 0\.5$"):
+        Codec(load(files), LIMITS)
 
 
 def codec():

@@ -98,8 +98,8 @@ def test_resolution_is_that_of_the_robots_dbc():
     for steps in (1, -1, 3, 777):
         angle_deg = math.degrees(steps * step.steering_wheel_rad)
         assert sent("SR_Command", "AngleCommand", angle_deg) == pytest.approx(angle_deg, abs=1e-9)
-    for name in ("AR_Command", "BR_Command"):
-        assert sent(name, "PositionCommand", 100.0 * step.pedal_norm) == pytest.approx(0.01, abs=1e-12)
+    for name, step_norm in (("AR_Command", step.accelerator_norm), ("BR_Command", step.brake_norm)):
+        assert sent(name, "PositionCommand", 100.0 * step_norm) == pytest.approx(0.01, abs=1e-12)
     assert sent("SR_Command", "AngleCommand", math.degrees(0.49 * step.steering_wheel_rad)) == 0.0
 
 

@@ -8,8 +8,9 @@ import socket
 
 import pytest
 
-from dbc.catalogue import ROBOTS_DBC
+from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from tests.support.processes import free_base_port, start_xilgate, wait_until, xilgate
+from tests.support.site import SITE_DBC, SITE_MAPPING
 from xil.cli_common import show
 from xil.scenario import scenario_path
 
@@ -105,6 +106,19 @@ def test_names_with_brackets_are_names(tmp_path):
     assert finished.returncode == 0, finished.stderr
     assert finished.stdout.splitlines() == ["PASS  every limit kept", f"report: {out / 'report.html'}"]
     assert "[/gate] 1" in (out / "report.html").read_text()
+
+
+SITE = ["--dbc", str(SITE_DBC), "--dbc", str(GNSS_IMU_DBC), "--mapping", str(SITE_MAPPING)]
+
+
+def test_a_drive_on_the_dbc_of_a_site_passes_and_comes_out_the_same_again(tmp_path):
+    finished = xilgate("drive", "--stage", "sil", "--out", str(tmp_path), *SITE)
+    assert finished.returncode == 0, finished.stderr
+    hashes = json.loads((tmp_path / "summary.json").read_text())["sha256"]
+    assert {"site_robots.dbc", "gnss_imu.dbc", "mapping"} <= hashes.keys()
+    assert json.loads((tmp_path / "configuration.json").read_text())["mapping"] == str(SITE_MAPPING)
+    again = xilgate("resim", str(tmp_path))
+    assert again.returncode == 0, again.stdout + again.stderr
 
 
 def test_late_write_error_is_one_line(tmp_path):

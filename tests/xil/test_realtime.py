@@ -4,12 +4,15 @@ import json
 import os
 import signal
 
+import can
 import pytest
 
 from controller.tuning import SetRequest, request
+from dbc.catalogue import GNSS_IMU_DBC
 from gateway.conditions import MAX_TICK_GAP_NS
 from gateway.telemetry import StateSample, Subscriber, decode
 from tests.support.processes import children, end, free_base_port, is_running, start_xilgate, wait_until
+from tests.support.site import SITE_DBC, SITE_MAPPING, load_site
 from tests.support.stall import StallProbe
 from vehicle_emulator.bus.channel import is_served
 from xil.resim import resim
@@ -22,13 +25,13 @@ EVERYONE = {"bus", "gateway", "controller", "emulator"}
 class Drive:
     """A running `xilgate drive` and its newest state and status."""
 
-    def __init__(self, out, scenario="iso3888-1", buses=("--bus", "emulated")):
+    def __init__(self, out, scenario="iso3888-1", buses=("--bus", "emulated"), dbc=()):
         self.port = port = free_base_port()
         self.out = out
         self.state = None
         self.status = None
         self._subscriber = Subscriber(self._receive, ["state", "status"], port)
-        arguments = ["--stage", "hil", *buses, "--out", str(out), "--telemetry-port", str(port)]
+        arguments = ["--stage", "hil", *buses, *dbc, "--out", str(out), "--telemetry-port", str(port)]
         self.process = start_xilgate("drive", scenario, *arguments)
         self.children = {}
 
@@ -177,6 +180,21 @@ def test_a_run_tells_the_controller_of_its_objects_and_keeps_what_was_tuned(tmp_
         assert "parameters version 1 by a test: planner.safe_time_s 1.2 -> 1.3" in (tmp_path / "controller.log").read_text()
     finally:
         drive.close()
+
+
+def test_every_process_speaks_the_dbc_of_a_site(tmp_path):
+    dbc = ["--dbc", str(SITE_DBC), "--dbc", str(GNSS_IMU_DBC), "--mapping", str(SITE_MAPPING)]
+    drive = Drive(tmp_path, "lane-keeping", dbc=dbc)
+    try:
+        drive.wait_for(lambda state: is_engaged(state) and state.vx_mps > 3.0, "the car to drive")
+        assert drive.children.keys() == EVERYONE
+        drive.process.send_signal(signal.SIGINT)
+        drive.process.communicate(timeout=20)
+    finally:
+        drive.close()
+    frames = [message for message in can.CanutilsLogReader(tmp_path / "bus.log") if not message.is_error_frame]
+    site = load_site()
+    assert {site.by_id[message.arbitration_id].sender for message in frames} == {"GW", "RC", "SR", "AR", "BR", "CAR", "INS"}
 
 
 def test_interrupting_a_real_car_stops_it_first(tmp_path):
