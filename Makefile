@@ -61,7 +61,7 @@ install-target:
 	$(TARGET_PIP) install --no-deps --no-build-isolation --no-index --force-reinstall .
 	@# What pip wrote names the place that it was put together in.
 	sed -i '1s|^#!$(TARGET)/|#!$(PREFIX)/|' $$(grep -lI '^#!$(TARGET)/' $(TARGET)/bin/*)
-	install -D -m 644 docs/target.md -t $(TARGET)/share/doc
+	install -D -m 644 docs/*.md -t $(TARGET)/share/doc
 	install -D -m 644 gateway/target/xilgate-gateway.service gateway/target/xilgate-controller.service -t $(SYSTEM)/systemd/system
 	install -D -m 644 gateway/target/80-xilgate-can0.network -t $(SYSTEM)/systemd/network
 	install -D -m 644 gateway/target/80-xilgate-can.rules -t $(SYSTEM)/udev/rules.d

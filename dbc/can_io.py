@@ -22,6 +22,9 @@ MAX_STANDARD_ID = 0x7FF
 EXTENDED_FLAG, REMOTE_FLAG, ERROR_FLAG = 0x8000_0000, 0x4000_0000, 0x2000_0000
 ERROR_CLASS_MASK = 0x1FFF_FFFF
 
+INTERFACES = tuple(sorted(can.VALID_INTERFACES))
+"""Names of the interfaces that there are: python-can's, and those of packages that extend it."""
+
 OPENING_ERRORS = (can.CanError, OSError, ValueError, ImportError, NotImplementedError, NameError)
 """What goes wrong when an interface is opened. NameError: python-can's Kvaser interface where the maker's library is not installed."""
 _REFUSALS = (can.CanError, OSError, ValueError)

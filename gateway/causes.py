@@ -53,7 +53,7 @@ class Cause(Enum):
     LATENCY = Meaning(50, "control lags", "ms")
     OVERSPEED = Meaning(51, "too fast for the limit profile", "m/s")
     SELECTOR_NOT_IN_DRIVE = Meaning(52, "selector is not in D", "")
-    OPERATOR_STOP = Meaning(53, "operator asked for a stop", "")
+    OPERATOR_STOP = Meaning(53, "a stop is asked for", "")
     DRIVER_STEERS = Meaning(60, "driver steers", "")
     DRIVER_BRAKES = Meaning(61, "driver brakes", "")
     DRIVER_ACCELERATES = Meaning(62, "driver accelerates", "")

@@ -145,7 +145,7 @@ class GatewayCore:
         self.blockers = self._blockers(situation)
         refused = [] if request is None else self._refusals(request, situation, self._last_request_ns)
         granted = None if refused or request is None else request.operation
-        transition = self._modes.update(now_ns, self._with_request(granted), self._triggers(granted))
+        transition = self._modes.update(now_ns, self._with_request(request, granted), self._triggers(granted))
         if transition is not None:
             self._enter(now_ns, transition)
         self._actuate(now_ns)
@@ -237,10 +237,12 @@ class GatewayCore:
             return [f"not possible in {self.mode.name}"]
         return refusals(request.operation, situation, self.blockers)
 
-    def _with_request(self, granted: Operation | None) -> list[Finding]:
-        """The findings, and what the operator wants ended."""
-        cause = None if granted is None else _CAUSE_OF_OPERATION.get(granted)
-        return self.findings if cause is None else [*self.findings, Finding(cause, 1, 0, "operator")]
+    def _with_request(self, request: OperatorRequest | None, granted: Operation | None) -> list[Finding]:
+        """The findings, and what the operator wants ended, or the gateway's own process before it ends."""
+        if request is None or granted not in _CAUSE_OF_OPERATION:
+            return self.findings
+        source = "operator" if request.boot_id != self._boot_id else "the gateway is to end"
+        return [*self.findings, Finding(_CAUSE_OF_OPERATION[granted], 1, 0, source)]
 
     def _triggers(self, granted: Operation | None) -> frozenset[Trigger]:
         blocked = [Trigger.BLOCKED] if self.blockers else []

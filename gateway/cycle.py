@@ -170,8 +170,11 @@ class ControlCycle:
             self._ending = Ending(now_ns, self._stop_within_ns)
             self._pulse.post(Notice(logging.INFO, f"asked to end in mode {mode.name}", {"mode": mode.name}))
         if self._ending is not None:
-            is_standing_known = output.state.is_valid
-            self.is_over = self._orders.ends > 1 or self._ending.is_over(now_ns, mode, output.state.vx_mps, is_standing_known)
+            state, is_in_haste = output.state, self._orders.ends > 1
+            self.is_over = is_in_haste or self._ending.is_over(now_ns, mode, state.vx_mps, state.is_valid)
+            if is_in_haste:
+                text = f"asked again: ends at once, in mode {mode.name} at {state.vx_mps:.1f} m/s"
+                self._pulse.post(Notice(logging.WARNING, text, {"mode": mode.name, "value": state.vx_mps, "unit": "m/s"}))
         elif (successor := self._pulse.successor) is not None:
             self._pulse.successor = None
             if mode in QUIET:

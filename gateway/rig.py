@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
+from dbc.can_io import INTERFACES
 from dbc.catalogue import NAVIGATION, ROBOTS
 from dbc.errors import UserMistake
 from dbc.realtime import GATEWAY_PRIORITY
@@ -34,6 +35,8 @@ def _bus(name: str) -> str:
     interface, _, channel = name.partition(":")
     if not (interface and channel):
         raise misfit("INTERFACE:CHANNEL, for example socketcan:can0")
+    if interface not in INTERFACES:
+        raise misfit(f"an interface of {', '.join(INTERFACES)}")
     return name
 
 

@@ -1,6 +1,7 @@
 """The control cycle with a stub car: what it tells, how it ends, when it takes another configuration, and what it never does."""
 
 import logging
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -53,6 +54,8 @@ def test_end_while_engaged_stops_the_car_first(bench):
     assert bench.mode is Mode.COMFORT_STOP
     assert abs(bench.car.vx_mps) < 0.1
     assert transitions(bench)[-1] == (Mode.ENGAGED, Mode.COMFORT_STOP)
+    report = bench.pulse.status.disengagement
+    assert (report.cause, report.source) == ("OPERATOR_STOP", "the gateway is to end")
     assert len(bench.replies) == 2  # an operator is not told what he did not ask
 
 
@@ -72,6 +75,10 @@ def test_second_request_to_end_is_obeyed_after_the_tick(bench):
     bench.orders.ends = 2
     assert bench.tick(10) == 1
     assert len(bench.frames) > sent  # the tick was a whole one
+    told = [event for event in bench.events() if isinstance(event, Notice)]
+    assert [event.level for event in told] == [logging.INFO, logging.WARNING]
+    assert re.fullmatch(r"asked again: ends at once, in mode COMFORT_STOP at \d+\.\d m/s", told[-1].text)
+    assert told[-1].fields["value"] > 1.0
 
 
 def test_end_when_ready_disarms_the_robots_first(bench):

@@ -279,7 +279,7 @@ def test_asked_to_end_while_it_drives_it_stops_the_car_first(hub, rig):
     said = messages(records)
     assert "reload refused: mode ENGAGED" in said
     stop = next(record for record in records if record["message"].startswith("ENGAGED -> "))
-    assert (stop["after"], stop["cause"]) == ("COMFORT_STOP", "OPERATOR_STOP")
+    assert (stop["after"], stop["cause"], stop["source"]) == ("COMFORT_STOP", "OPERATOR_STOP", "the gateway is to end")
     assert said.index("asked to end in mode ENGAGED") < said.index(stop["message"])
     assert not any("nominal" in line for line in said)
 

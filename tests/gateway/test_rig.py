@@ -76,6 +76,7 @@ MISTAKES = {
     "speed = 3": ("speed", "unknown key"),
     'buses = { robots = "can0" }': ("buses.robots", "'can0'", "INTERFACE:CHANNEL"),
     'buses = { robots = "socketcan:" }': ("buses.robots", "'socketcan:'", "INTERFACE:CHANNEL"),
+    'buses = { robots = "sockecan:can0" }': ("buses.robots", "'sockecan:can0'", "an interface of", "socketcan", "xilgate"),
     'buses = { robots = 3 }': ("buses.robots", "3", "string"),
     'buses = { navigation = "socketcan:can0" }': ("buses.robots", "missing"),
     'car = { dbc = [], vehicle = "v" }': ("car.dbc", "at least one"),

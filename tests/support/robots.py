@@ -73,8 +73,9 @@ class StubCar:
         for frame in frames:
             spec = self.catalogue.by_id[frame.arbitration_id]
             self.told[spec.name] = self.catalogue.decode(spec, frame)
-        if "GW_SafetyCommand" in self.told:
-            request = self._requests[self.told["GW_SafetyCommand"]["SystemRequest"]]
+            if spec.name != "GW_SafetyCommand":
+                continue
+            request = self._requests[self.told[spec.name]["SystemRequest"]]
             self._state = {"Disarm": "Disarmed", "None": "Disarmed", "Arm": "Armed", "Engage": "Engaged"}[request]
 
     @property

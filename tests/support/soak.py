@@ -70,6 +70,8 @@ def heal(world: World) -> None:
 def operate(world: World) -> None:
     """What operator and driver do now."""
     car, mode = world.car, world.mode
+    if mode in (Mode.SILENT, Mode.FAULT):
+        car.let_go()  # nobody commands the robots
     is_driven = mode in (Mode.ENGAGED, Mode.COMFORT_STOP, Mode.SAFE_STOP)
     car.foot_percent = FOOT_PERCENT if not is_driven and (mode is Mode.FAULT or world.core.blockers) else 0.0
     if mode in (Mode.SAFE_STOP, Mode.COMFORT_STOP, Mode.FAULT) and car.vx_mps < 0.05:
