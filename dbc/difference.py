@@ -37,10 +37,11 @@ class Change:
 
 def compare(old: DbcFile, new: DbcFile) -> list[Change]:
     """All differences, those that break first."""
-    changes = [*_file(old, new)]
+    nodes = _renamed_nodes(old, new)
+    changes = [*_file(old, new), *(Change(True, "", "", "node", before, after) for before, after in nodes.items())]
     names = _counterparts(old.messages, new.messages, lambda message: message.frame_id)
     for before in old.messages:
-        changes += _message(before, names[before.name])
+        changes += _message(before, names[before.name], nodes)
     kept = {after.name for after in names.values() if after}
     added = (message for message in new.messages if message.name not in kept)
     changes += [Change(False, message.name, "", "added", "", f"0x{message.frame_id:X}") for message in added]
@@ -53,6 +54,25 @@ def _file(old: DbcFile, new: DbcFile) -> Iterator[Change]:
             yield Change(True, "", "", what, str(before), str(after))
 
 
+def _renamed_nodes(old: DbcFile, new: DbcFile) -> dict[str, str]:
+    """Nodes that are gone, each with the new one that sends and receives exactly what it did."""
+    before, after = _places(old), _places(new)
+    come = {frozenset(after[node]): node for node in after.keys() - before.keys()}
+    return {node: come[places] for node, found in before.items() if node not in after and (places := frozenset(found)) in come}
+
+
+def _places(file: DbcFile) -> dict[str, set[tuple[int, int]]]:
+    """What each node sends (the identifier and -1) and receives (the identifier and the first bit)."""
+    places: dict[str, set[tuple[int, int]]] = {}
+    for message in file.messages:
+        for node in message.senders:
+            places.setdefault(node, set()).add((message.frame_id, -1))
+        for signal in message.signals:
+            for node in signal.receivers:
+                places.setdefault(node, set()).add((message.frame_id, signal.start))
+    return places
+
+
 def _counterparts(old: Sequence[_Item], new: Sequence[_Item], identity: Callable[[_Item], object]) -> dict[str, _Item | None]:
     """What became of each old item: the new one of its name, else one of another name that is the same otherwise, else None."""
     by_name = {item.name: item for item in new}
@@ -61,13 +81,15 @@ def _counterparts(old: Sequence[_Item], new: Sequence[_Item], identity: Callable
     return {item.name: by_name.get(item.name) or others.get(identity(item)) for item in old}
 
 
-def _message(old: Message, new: Message | None) -> Iterator[Change]:
+def _message(old: Message, new: Message | None, nodes: Mapping[str, str]) -> Iterator[Change]:
     if new is None:
         yield Change(True, old.name, "", "removed", f"0x{old.frame_id:X}", "")
         return
     for what, fact in _MESSAGE_FACTS.items():
         if (before := fact(old)) != (after := fact(new)):
             yield Change(True, old.name, "", what, before, after)
+    if [nodes.get(node, node) for node in old.senders] != new.senders:
+        yield Change(True, old.name, "", "sender", ", ".join(old.senders), ", ".join(new.senders))
     timeouts_ms = [_whole(message, "GenMsgTimeout") for message in (old, new)]
     if timeouts_ms[0] != timeouts_ms[1]:
         # No timeout is the longest. Who sends as late as the old one allows must not be called missing by the new.
@@ -75,23 +97,24 @@ def _message(old: Message, new: Message | None) -> Iterator[Change]:
         yield Change(is_shorter, old.name, "", "timeout", *(f"{timeout_ms} ms" for timeout_ms in timeouts_ms))
     signals = _counterparts(old.signals, new.signals, lambda signal: (_layout(signal), _multiplexing(signal)))
     for before_signal in old.signals:
-        yield from _signal(old.name, before_signal, signals[before_signal.name])
+        yield from _signal(old.name, before_signal, signals[before_signal.name], nodes)
     kept = {after.name for after in signals.values() if after}
     for signal in new.signals:
         if signal.name not in kept:
             yield Change(False, old.name, signal.name, "added", "", _layout(signal))
 
 
-def _signal(message: str, old: Signal, new: Signal | None) -> Iterator[Change]:
+def _signal(message: str, old: Signal, new: Signal | None, nodes: Mapping[str, str]) -> Iterator[Change]:
     if new is None:
         yield Change(True, message, old.name, "removed", _layout(old), "")
         return
     for what, fact in _SIGNAL_FACTS.items():
         if (before := fact(old)) != (after := fact(new)):
             yield Change(True, message, old.name, what, before, after)
-    if added := sorted(set(new.receivers) - set(old.receivers)):
+    receivers = {nodes.get(node, node) for node in old.receivers}
+    if added := sorted(set(new.receivers) - receivers):
         yield Change(False, message, old.name, "receiver added", "", ", ".join(added))
-    if removed := sorted(set(old.receivers) - set(new.receivers)):
+    if removed := sorted(receivers - set(new.receivers)):
         yield Change(False, message, old.name, "receiver removed", ", ".join(removed), "")
     before_table, after_table = _table(old), _table(new)
     for raw in sorted(before_table.keys() | after_table.keys()):
@@ -129,7 +152,6 @@ _MESSAGE_FACTS: Mapping[str, Callable[[Message], str]] = {
     "name": lambda message: message.name,
     "identifier": lambda message: f"0x{message.frame_id:X}{' extended' if message.is_extended_frame else ''}",
     "length": lambda message: f"{message.length} bytes",
-    "sender": lambda message: ", ".join(message.senders),
     "cycle time": lambda message: f"{_whole(message, 'GenMsgCycleTime')} ms",
     "end-to-end protection": _protection,
 }

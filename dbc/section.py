@@ -97,5 +97,6 @@ def _mistake(path: Path, content: type[Section], details: ErrorDetails) -> str:
     if details["type"] == "extra_forbidden":
         return f"{path}: {key}: unknown key"
     value: Any = details["input"]
+    message = "allowed: a path" if details["type"] == "path_type" else details["msg"]
     shown = "" if isinstance(value, dict | list) else f" = {value!r}"
-    return f"{path}: {key}{shown}: {details['msg']}"
+    return f"{path}: {key}{shown}: {message}"

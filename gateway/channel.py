@@ -89,7 +89,7 @@ def operator_client(control: ControlPath) -> "OperatorClient":
         KeyMistake, SetupFailure: see `keys.load_key`.
     """
     if not _is_served(control.operator_socket):
-        raise ChannelError(f"no gateway listens on {control.operator_socket}; `--control` names the directory of another")
+        raise ChannelError(f"no gateway listens on {control.operator_socket}; `--control` or a rig file names another directory")
     return OperatorClient(control.operator_socket, control.key())
 
 
@@ -112,7 +112,7 @@ class _Socket:
     def _bind(self, path: Path) -> None:
         if _is_served(path):
             self._socket.close()
-            raise ChannelError(f"control socket {path} is in use by another process; stop it, or choose another directory with --control")
+            raise ChannelError(f"control socket {path} is in use by another process; stop it, or name another directory")
         try:
             path.unlink(missing_ok=True)
             os.fchmod(self._socket.fileno(), _SOCKET_MODE)  # before it has a name: nobody can come in between

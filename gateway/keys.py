@@ -85,6 +85,8 @@ def _opened(path: Path) -> int:
         # Not blocking: a pipe of this name must not hold the start up.
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
+        if not path.parent.is_dir():
+            raise KeyMistake(f"{path}: there is no directory {path.parent}") from error
         raise KeyMistake(f"{path}: no such file; `xilgate make-key FILE` makes a key of the control path") from error
     except OSError as error:
         if error.errno == errno.ELOOP:

@@ -2,20 +2,30 @@
 
 from collections.abc import Iterator
 
+from gateway import modes
 from gateway.causes import Cause
 from gateway.messages import Mode
 from gateway.modes import REACTIONS, TRANSITIONS, Trigger
 
 _INTRODUCTION = """# Modes of the gateway
 
-Written from the tables in `gateway/modes.py` by `python -m gateway.mode_diagram > docs/modes.md`; a test compares. What each mode means is
-told there, what arms and engages in `gateway/conditions.py`.
+Written from the tables in `gateway/modes.py` by `python -m gateway.mode_diagram > docs/modes.md`; a test compares. What arms
+and engages is in `gateway/conditions.py`.
 """
 
 
 def page() -> str:
     """The whole page."""
-    return "\n".join([_INTRODUCTION, *_diagram(), "", *_causes(), ""])
+    return "\n".join([_INTRODUCTION, *_meanings(), "", *_diagram(), "", *_causes(), ""])
+
+
+def _meanings() -> Iterator[str]:
+    yield "| mode | meaning |"
+    yield "|---|---|"
+    for line in (modes.__doc__ or "").splitlines():
+        name, _, meaning = line.strip().partition(" ")
+        if name in Mode.__members__:
+            yield f"| {name} | {meaning.strip()} |"
 
 
 def _diagram() -> Iterator[str]:

@@ -60,11 +60,11 @@ def _newest(board: Board, topic: str, kind: type[SampleT]) -> SampleT | None:
 
 def _state_rows(state: StateSample) -> list[Row]:
     return [
-        ("Speed", f"{state.vx_mps * 3.6:.1f} km/h", ""),
-        ("Pose", f"x {state.x_m:.2f} m   y {state.y_m:.2f} m   yaw {math.degrees(state.yaw_rad):.1f}°", "" if state.is_valid else "red"),
-        ("SR", f"{math.degrees(state.sr_angle_rad):+.1f}°   commanded {math.degrees(state.sr_command_rad):+.1f}°", ""),
-        ("AR", f"{state.ar_position_norm * 100:.0f} %   commanded {state.ar_command_norm * 100:.0f} %", ""),
-        ("BR", f"{state.br_position_norm * 100:.0f} %   commanded {state.br_command_norm * 100:.0f} %", ""),
+        ("Speed", f"{state.vx_mps * 3.6:z.1f} km/h", ""),
+        ("Pose", f"x {state.x_m:z.2f} m   y {state.y_m:z.2f} m   yaw {math.degrees(state.yaw_rad):z.1f}°", "" if state.is_valid else "red"),
+        ("SR", f"{math.degrees(state.sr_angle_rad):+z.1f}°   commanded {math.degrees(state.sr_command_rad):+z.1f}°", ""),
+        ("AR", f"{state.ar_position_norm * 100:z.0f} %   commanded {state.ar_command_norm * 100:z.0f} %", ""),
+        ("BR", f"{state.br_position_norm * 100:z.0f} %   commanded {state.br_command_norm * 100:z.0f} %", ""),
     ]
 
 
@@ -76,8 +76,8 @@ def _command_rows(command: CommandSample) -> list[Row]:
     return [
         ("Command", command.status, "" if command.status == "OK" else "yellow"),
         ("Solver", solved, solve_style),
-        ("Tracking", f"lateral {command.lateral_error_m:+.3f} m   speed {command.speed_error_mps * 3.6:+.1f} km/h", ""),
-        ("Disturbance", f"{command.disturbance_mps2:+.2f} m/s²", ""),
+        ("Tracking", f"lateral {command.lateral_error_m:+z.3f} m   speed {command.speed_error_mps * 3.6:+z.1f} km/h", ""),
+        ("Disturbance", f"{command.disturbance_mps2:+z.2f} m/s²", ""),
         ("Objects", f"{command.objects} considered{rejected}", "yellow" if rejected else ""),
         ("Parameters", f"version {command.parameters_version}", ""),
     ]
@@ -98,7 +98,7 @@ def _status_rows(status: StatusSample) -> list[Row]:
         ("Frames", f"{status.frames_received} received   {rejected} rejected", "yellow" if rejected else ""),
         ("Commands", f"{refused} rejected", "yellow" if refused else ""),
         ("Limits", _limits_text(status), "yellow" if status.limits else ""),
-        ("Actuation", f"on a measurement {status.actuation_age_ms:.0f} ms old   largest {status.actuation_age_max_ms:.0f} ms", ""),
+        ("Actuation", f"on a measurement {status.actuation_age_ms:z.0f} ms old   largest {status.actuation_age_max_ms:z.0f} ms", ""),
         *([("Buses", _buses_text(status), "red" if status.dead_buses else "")] if status.buses else []),
         ("Ticks", f"{status.ticks}   {status.ticks_late} late   step {status.step_cpu_ms:.2f} ms CPU", ""),
     ]
@@ -149,7 +149,7 @@ def table(board: Board, now_ns: int) -> Group:
     if profile := _newest(board, "profile", ProfileSample):
         rows.append(_profile_row(profile))
     if world := _newest(board, "world", WorldSample):
-        rows.append(("Ground truth", f"x {world.x_m:.2f} m   y {world.y_m:.2f} m   {world.vx_mps * 3.6:.1f} km/h", ""))
+        rows.append(("Ground truth", f"x {world.x_m:z.2f} m   y {world.y_m:z.2f} m   {world.vx_mps * 3.6:z.1f} km/h", ""))
     grid = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column()
@@ -163,7 +163,7 @@ def line(board: Board, now_ns: int) -> str:
     """The same in one line, for a log or a pipe."""
     parts = [_mode(board, now_ns)[0]]
     if state := _newest(board, "state", StateSample):
-        parts.append(f"{state.vx_mps * 3.6:.1f} km/h x {state.x_m:.2f} m y {state.y_m:.2f} m")
+        parts.append(f"{state.vx_mps * 3.6:z.1f} km/h x {state.x_m:z.2f} m y {state.y_m:z.2f} m")
     if command := _newest(board, "command", CommandSample):
         parts.append(f"command {command.status} solve {command.solve_time_ms:.2f} ms")
     if status := _newest(board, "status", StatusSample):

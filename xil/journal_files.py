@@ -115,6 +115,8 @@ def find_journals(path: Path) -> list[Journal]:
     Raises:
         JournalError: there is none, or its beginning is gone.
     """
+    if not path.exists():
+        raise JournalError(f"{path}: no such file or directory")
     if path.is_dir():
         files = [file for file in path.iterdir() if _FILE_NAME.fullmatch(file.name)]
     else:

@@ -339,8 +339,8 @@ def _counts(recording: Recording) -> Iterator[Metric]:
     if isinstance(status, StatusSample):
         yield Metric("frames rejected", float(sum(status.frames_rejected.values())), "")
         yield Metric("commands rejected", float(sum(status.commands_rejected.values())), "")
-        yield Metric("demands held back by the gateway's limits", 100.0 * status.limited_share, "%")
-        yield from (Metric(f"limit acted: {name}", float(limit.ticks), "ticks") for name, limit in status.limits.items())
+        yield Metric("demands held back by limits, beyond the smoothing of a plan's steps", 100.0 * status.limited_share, "%")
+        yield from (Metric(f"ticks at a limit, smoothing too: {name}", float(limit.ticks), "") for name, limit in status.limits.items())
         yield Metric("age of the measurement that robots act on, largest", status.actuation_age_max_ms, "ms")
 
 

@@ -208,12 +208,14 @@ class Played:
     Attributes:
         sent: frames, by channel.
         left_out: frames, by the reason.
+        not_found: ids that were asked for and are not in the record.
         latest_ns: by how much the latest frame was late [ns].
         duration_ns: from the first frame sent to the last [ns].
     """
 
     sent: Counter[str] = field(default_factory=Counter)
     left_out: Counter[str] = field(default_factory=Counter)
+    not_found: list[int] = field(default_factory=list)
     latest_ns: int = 0
     duration_ns: int = 0
 
@@ -256,7 +258,9 @@ class Player:
             SetupFailure: a bus takes no frames.
         """
         start_ns = self._clock()
+        awaited = set(self._selection.ids or ())
         for frame in frames:
+            awaited.discard(frame.message.arbitration_id)
             reason = "other channel" if frame.channel not in self._send else self._selection.refusal(frame.message)
             if reason:
                 self.played.left_out[reason] += 1
@@ -271,6 +275,7 @@ class Player:
             self.played.sent[frame.channel] += 1
             self.played.latest_ns = max(self.played.latest_ns, now_ns - deadline_ns)
             self.played.duration_ns = now_ns - start_ns
+        self.played.not_found = sorted(awaited)
 
     def _hand_over(self, frame: RecordedFrame) -> None:
         """Send a frame, again and again while the bus has no room: nothing is skipped."""
@@ -332,5 +337,6 @@ def played_text(played: Played) -> str:
     """What was played, for people."""
     sent = ", ".join(f"{count} on {ascii(channel)[1:-1]}" for channel, count in played.sent.items()) or "nothing"
     left_out = ", ".join(f"{count} {reason}" for reason, count in played.left_out.items()) or "none"
+    not_found = "; not in the record: " + ", ".join(f"0x{number:X}" for number in played.not_found) if played.not_found else ""
     seconds, late_ms = played.duration_ns / _NS_PER_S, played.latest_ns * 1e-6
-    return f"sent {sent} in {seconds:.3f} s; latest frame {late_ms:.1f} ms late; left out: {left_out}"
+    return f"sent {sent} in {seconds:.3f} s; latest frame {late_ms:.1f} ms late; left out: {left_out}{not_found}"

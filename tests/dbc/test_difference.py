@@ -1,5 +1,7 @@
 """What is different between two DBC files, and what of it breaks those who stay with the old one."""
 
+import re
+
 import pytest
 
 from dbc.catalogue import ROBOTS_DBC
@@ -84,6 +86,16 @@ def test_one_change(tmp_path, before, after, change):
         assert found == [Change(True, name, "", "cycle time", "10 ms", "20 ms") for name in ("X", "Y")]
     else:
         assert found == [change]
+
+
+def test_a_node_of_another_name_is_one_change(tmp_path):
+    text = ROBOTS_DBC.read_text()
+    lines = [re.sub(r"\bRC\b", "SUPERVISOR", line) if re.match(r" SG_|BO_|BU_", line) else line for line in text.splitlines()]
+    (tmp_path / "new.dbc").write_text("\n".join(lines) + "\n")
+    assert compare(read_dbc(ROBOTS_DBC), read_dbc(tmp_path / "new.dbc")) == [Change(True, "", "", "node", "RC", "SUPERVISOR")]
+    # One that does not all that the other did is another node.
+    found = differences(tmp_path, ("BU_: A B", "BU_: A B C"), ("BO_ 1 X: 8 A", "BO_ 1 X: 8 C"))
+    assert found == [Change(True, "X", "", "sender", "A", "C")]
 
 
 def test_no_change(tmp_path):

@@ -313,7 +313,7 @@ def test_an_answer_without_the_key_or_to_somebody_else_is_none(server, tmp_path)
 def test_without_a_gateway_the_operator_is_told_so(tmp_path):
     with pytest.raises(ChannelError, match=f"no gateway listens on {tmp_path}/operator"):
         OperatorClient(tmp_path / "operator", KEY)
-    with pytest.raises(ChannelError, match=r"no gateway listens on .*operator\.sock; `--control`"):
+    with pytest.raises(ChannelError, match=r"no gateway listens on .*operator\.sock; `--control` or a rig file"):
         operator_client(control_path(tmp_path / "nowhere"))
     assert list(tmp_path.iterdir()) == []
 

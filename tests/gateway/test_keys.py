@@ -111,6 +111,7 @@ def test_only_a_regular_file_is_a_key(key_file, tmp_path):
     refused(tmp_path, "no regular file")
     refused(tmp_path / "nobody", "no such file", "xilgate make-key")
     refused(key_file / "below", "Not a directory")
+    refused(tmp_path / "nowhere" / "key", f"there is no directory {tmp_path}/nowhere")
 
 
 def test_keys_that_cannot_be_made(tmp_path):

@@ -98,7 +98,7 @@ MISTAKES = {
     "daemon = { watchdog_s = 0.0 }": ("daemon.watchdog_s", "0.0", "0.2 to 10"),
     "daemon = { stop_within_s = inf }": ("daemon.stop_within_s", "inf", "finite"),
     'hashes = { limits = "abc" }': ("hashes.limits", "'abc'", "64 hexadecimal digits"),
-    "control = { key = 7 }": ("control.key", "7", "path"),
+    "control = { key = 7 }": ("control.key", "7", "allowed: a path"),
 }
 
 

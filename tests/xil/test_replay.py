@@ -336,9 +336,9 @@ def test_the_command_line_tells_what_is_in_a_record_and_what_it_played(tmp_path)
     path = write(tmp_path / "record.blf", recorded(50, lambda k: 0))
     listed = xilgate("replay", str(path), "--json")
     assert json.loads(listed.stdout) == [{"channel": "0", "frames": 50, "ids": 7, "from_s": 0.0, "to_s": pytest.approx(0.49, abs=1e-5)}]
-    played = xilgate("replay", str(path), "--bus", "virtual:x", "--speed", "2", "--id", "0x101", "--id", "0x102")
+    played = xilgate("replay", str(path), "--bus", "virtual:x", "--speed", "2", "--id", "0x101", "--id", "0x102", "--id", "0x7FE")
     assert played.returncode == 0, played.stderr
     assert played.stdout.startswith("sent 14 on 0 in 0.2")
-    assert played.stdout.rstrip().endswith("left out: 36 other id")
+    assert played.stdout.rstrip().endswith("left out: 36 other id; not in the record: 0x7FE")
     refused = xilgate("replay", str(Path(path).with_suffix(".txt")))
     assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1)

@@ -172,6 +172,8 @@ def test_a_mistake_is_one_line_and_exit_code_2(tmp_path):
     assert finished.returncode == 2
     assert finished.stderr.startswith(f"xilgate: {tmp_path}: no journal")
     assert len(finished.stderr.splitlines()) == 1
+    with pytest.raises(JournalError, match=r"/nothing/there: no such file or directory$"):
+        resim(tmp_path / "nothing" / "there", silent)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
