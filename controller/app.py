@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -31,8 +30,6 @@ from gateway.telemetry import DEFAULT_BASE_PORT, Publisher, Source, TlsSection, 
 log = logging.getLogger("xilgate.controller")
 
 _WARM_UP_SOLVES = 10
-_SWITCH_INTERVAL_S = 0.5e-3
-"""Longest time that Python code on another thread of this process keeps the control thread waiting; Python's own choice is 5 ms."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,6 @@ def run(options: ControllerOptions, stop: threading.Event) -> None:
     ):
         telemetry.serve(SERVICE, TuningService(store).answer)
         cycle = ControlCycle(nmpc, solver.name, channel, telemetry, store=store, inbox=inbox, sha256=fingerprint(session))
-        sys.setswitchinterval(_SWITCH_INTERVAL_S)
         become_realtime(CONTROLLER_PRIORITY)
         loop = PeriodicLoop(PLAN_PERIOD_NS)
         while not stop.is_set():

@@ -155,6 +155,8 @@ class ControlCycle:
             frames_dropped=buses.dropped,
             frames_unsent=buses.unsent,
             links=buses.health(),
+            bus_errors=buses.bus_errors,
+            bus_refusals=buses.refusals,
             datagrams_rejected={f"no datagram of the {sender}'s": count for sender, count in rejected.items() if count},
             ticks_unrecorded=self._record.lost,
             record_problem=self._record.problem,

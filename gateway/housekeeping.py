@@ -108,6 +108,7 @@ class Housekeeper:
         self._is_stalled = False
         self._is_stopping = False
         self._bus_states: Mapping[str, str] = {}
+        self._bus_refusals: Mapping[str, str] = {}
         self._record_problem = ""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
@@ -161,6 +162,10 @@ class Housekeeper:
             if state != self._bus_states.get(network, BusState.ERROR_ACTIVE.value):
                 log.warning("bus of the %s: %s", network, state, extra={"bus": network, "state": state})
         self._bus_states = status.buses
+        for network, refusal in status.bus_refusals.items():
+            if refusal != self._bus_refusals.get(network, ""):
+                log.warning("bus of the %s: bus-off cannot be left: %s", network, refusal, extra={"bus": network})
+        self._bus_refusals = status.bus_refusals
         if status.record_problem != self._record_problem:
             self._record_problem = status.record_problem
             log.warning("record: %s", status.record_problem or "goes on")

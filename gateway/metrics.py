@@ -62,6 +62,7 @@ def _of_status(status: StatusSample) -> Iterable[Metric]:
         _labelled(CounterMetricFamily, "commands_rejected", "Commands ignored.", "cause", status.commands_rejected),
         _labelled(CounterMetricFamily, "frames_unsent", "Frames not sent.", "cause", status.frames_unsent),
         _bus_states(status.buses),
+        _labelled(CounterMetricFamily, "bus_errors", "Frames destroyed on the bus, or not acknowledged.", "bus", status.bus_errors),
         _counter("ticks_unrecorded", "Ticks missing in the record.", status.ticks_unrecorded),
         GaugeMetricFamily(_PREFIX + "blockers", "Conditions that keep the gateway from the next mode.", len(status.blockers)),
         GaugeMetricFamily(_PREFIX + "command_age_seconds", "Age of the newest command.", status.command_age_ms * 1e-3),

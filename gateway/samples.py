@@ -39,6 +39,8 @@ class Process:
     frames_dropped: Mapping[str, int] = field(default_factory=dict)
     frames_unsent: Mapping[str, int] = field(default_factory=dict)
     links: Mapping[str, LinkHealth] = field(default_factory=dict)
+    bus_errors: Mapping[str, int] = field(default_factory=dict)
+    bus_refusals: Mapping[str, str] = field(default_factory=dict)
     datagrams_rejected: Mapping[str, int] = field(default_factory=dict)
     ticks_unrecorded: int = 0
     record_problem: str = ""
@@ -111,6 +113,8 @@ def _status(seq: int, core: GatewayCore, now_ns: int, process: Process) -> Statu
         step_cpu_ms=process.step_cpu_ms,
         dead_buses=list(process.dead_buses),
         buses={network: health.state.value for network, health in process.links.items()},
+        bus_errors=dict(process.bus_errors),
+        bus_refusals=dict(process.bus_refusals),
         frames_unsent=dict(process.frames_unsent),
         ticks_unrecorded=process.ticks_unrecorded,
         record_problem=process.record_problem,

@@ -191,6 +191,8 @@ class StatusSample(Sample, frozen=True, kw_only=True):
         blockers: what keeps the gateway from the next mode; empty when it may engage.
         dead_buses: networks whose bus refuses to deliver or to accept frames.
         buses: state of our CAN controller on the bus of every network.
+        bus_errors: frames that were destroyed on the bus of every network, or that nobody acknowledged.
+        bus_refusals: why our CAN controller could not be asked to leave bus-off, by network.
         frames_unsent: frames that were to be sent and were not, by cause.
         ticks_unrecorded: ticks that are missing in the record.
         record_problem: why nothing is recorded; empty while all is well or nothing is to be.
@@ -217,6 +219,8 @@ class StatusSample(Sample, frozen=True, kw_only=True):
     step_cpu_ms: float
     dead_buses: list[str] = []
     buses: dict[str, str] = {}
+    bus_errors: dict[str, int] = {}
+    bus_refusals: dict[str, str] = {}
     frames_unsent: dict[str, int] = {}
     ticks_unrecorded: int = 0
     record_problem: str = ""

@@ -152,8 +152,15 @@ def test_a_bus_is_told_when_its_state_changes(notifier, caplog):
         time.sleep(0.2)
         bench.pulse.status = msgspec.structs.replace(status, buses={"robots": "bus-off"})
         wait_until(lambda: caplog.records, 5, "a line")
-    (record,) = caplog.records
-    assert (record.message, record.bus) == ("bus of the robots: bus-off", "robots")
+        refusals = {"robots": "Operation not permitted"}
+        bench.pulse.status = msgspec.structs.replace(status, buses={"robots": "bus-off"}, bus_refusals=refusals)
+        wait_until(lambda: len(caplog.records) > 1, 5, "another line")
+        time.sleep(0.2)
+    said = [(record.message, record.bus) for record in caplog.records if hasattr(record, "bus")]
+    assert said == [
+        ("bus of the robots: bus-off", "robots"),
+        ("bus of the robots: bus-off cannot be left: Operation not permitted", "robots"),
+    ]
 
 
 def mistaken():

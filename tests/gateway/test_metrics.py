@@ -52,6 +52,7 @@ def test_a_gateway_that_drives(logs):
     assert found[(prefix + "frames_received_total",)] == bench.pulse.status.frames_received > 0
     assert found[prefix + "bus_state", "error-active", "robots"] == 1.0
     assert found[prefix + "bus_state", "bus-off", "robots"] == 0.0
+    assert found[prefix + "bus_errors_total", "robots"] == 0.0
     assert (found[prefix + "realtime_granted", "priority"], found[prefix + "realtime_granted", "memory"]) == (1.0, 0.0)
     assert found[(prefix + "log_records_dropped_total",)] == 3.0
     assert found[(prefix + "step_cpu_seconds_count",)] == bench.pulse.ticks

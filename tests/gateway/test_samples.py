@@ -20,6 +20,11 @@ def test_a_dead_bus_and_dropped_frames_are_told():
     assert (sample.ticks_late, sample.step_cpu_ms) == (3, 0.5)
 
 
+def test_errors_on_the_bus_and_a_bus_off_that_cannot_be_left_are_told():
+    sample = status(Process(bus_errors={"robots": 4}, bus_refusals={"robots": "Operation not permitted"}))
+    assert (sample.bus_errors, sample.bus_refusals) == ({"robots": 4}, {"robots": "Operation not permitted"})
+
+
 def test_in_virtual_time_there_is_nothing_to_tell():
     sample = status(Process())
     assert sample.dead_buses == []

@@ -38,6 +38,7 @@ class StubBuses:
     def __init__(self, bench):
         self._bench = bench
         self.dead, self.dropped, self.unsent = [], {}, {}
+        self.bus_errors, self.refusals = {"robots": 0}, {}
         self.recoveries = 0
 
     def receive(self):

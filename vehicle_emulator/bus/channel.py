@@ -3,10 +3,10 @@
 import os
 import re
 import socket
-import stat
 from pathlib import Path
 
 from dbc.errors import SetupFailure
+from dbc.runtime_directory import runtime_directory
 
 LOOPBACK = "127.0.0.1"
 
@@ -41,26 +41,17 @@ def address_of(channel: str) -> Address:
 def socket_path(channel: str) -> Path:
     """Socket of a channel; its directory is created if need be.
 
-    The directory is `$XDG_RUNTIME_DIR/xilgate`, or `/tmp/xilgate-UID` where there is no such run-time directory.
-
     Raises:
-        BusError: not a channel name, or the directory is not safe to use.
+        BusError: not a channel name, a path that is too long, or a directory that is not safe to use, see `runtime_directory`.
     """
     if not _NAME.fullmatch(channel):
         raise BusError(f"channel {channel!r}: expected 1 to 32 letters, digits, - or _")
-    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
-    directory = Path(runtime, "xilgate") if os.path.isabs(runtime) and os.path.isdir(runtime) else Path(f"/tmp/xilgate-{os.getuid()}")
-    path = directory / f"{channel}.sock"
+    try:
+        path = runtime_directory() / f"{channel}.sock"
+    except SetupFailure as error:
+        raise BusError(str(error)) from error
     if len(os.fsencode(path)) > _MAX_PATH_BYTES:
         raise BusError(f"{path}: longer than the {_MAX_PATH_BYTES} bytes of a socket name; set XDG_RUNTIME_DIR to a shorter path")
-    try:
-        directory.mkdir(mode=0o700, exist_ok=True)
-        found = directory.lstat()
-    except OSError as error:
-        raise BusError(f"{directory}: {error.strerror}") from error
-    # Others can create names in /tmp: whoever owned the directory could feed frames to the controller.
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
-        raise BusError(f"{directory}: expected a directory of user {os.getuid()} with mode 0700")
     return path
 
 

@@ -130,7 +130,7 @@ def unpack(packet: bytes) -> tuple[BusFrame, int, bool] | Control:
     if packet[:1] == _CONTROL_KIND:
         try:
             return _DECODER.decode(packet[1:])
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise WireError(f"control packet: {error}") from error
     if len(packet) < _HEADER_BYTES:
         raise WireError(f"packet of {len(packet)} bytes, expected {_HEADER_BYTES} or more")

@@ -88,6 +88,7 @@ def test_any_packet_is_something_that_packs_again_or_a_wire_error(packet):
         (b"\x02" + msgspec.msgpack.encode({"type": "Disturb", "arbitration_id": 2**29, "count": 1}), "Expected `int` <= 536870911"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Settings", "filters": [[1, 2, None]] * 65}), "length <= 64"),
         (b"\x02" + msgspec.msgpack.encode({"type": "Restart", "now": True}), "unknown field `now`"),
+        (b"\x02\x82\xa1x" + b"\x91" * 4000 + b"\xc0\xa4type\xa7Restart", "control packet: maximum recursion depth"),
     ],
 )
 def test_what_is_no_packet_is_refused(packet, cause):
