@@ -14,7 +14,7 @@ from typing import Literal
 import msgspec
 
 from controller.parameters import Accepted, Entry, ParameterStore, Refused
-from gateway.telemetry import DEFAULT_BASE_PORT, Source, TelemetryError, ask
+from gateway.telemetry import DEFAULT_BASE_PORT, Source, TelemetryError, TlsSection, ask
 
 SERVICE = "parameters"
 
@@ -160,13 +160,13 @@ class TuningService:
         return verdict
 
 
-def request(content: Request, base_port: int = DEFAULT_BASE_PORT) -> Answer:
-    """Ask the controller that runs on these ports.
+def request(content: Request, base_port: int = DEFAULT_BASE_PORT, tls: TlsSection | None = None) -> Answer:
+    """Ask the controller that runs on these ports, or on another machine.
 
     Raises:
         TelemetryError: no controller answers.
     """
-    answer = ask(Source.CONTROLLER, SERVICE, msgspec.json.encode(content), base_port)
+    answer = ask(Source.CONTROLLER, SERVICE, msgspec.json.encode(content), base_port, tls=tls)
     try:
         return _ANSWERS.decode(answer)
     except (msgspec.DecodeError, UnicodeDecodeError) as error:

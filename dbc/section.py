@@ -85,6 +85,19 @@ def checked(path: Path, tree: dict[str, Any], content: type[Content], error_clas
         raise error_class("\n".join(_mistake(path, content, details) for details in error.errors())) from error
 
 
+def absolute(value: Any, base: Path) -> Any:  # noqa: ANN401 - any part of a section
+    """Any part of a section with every path in it absolute: what has no leading slash is below `base`."""
+    match value:
+        case Path():
+            return base / value
+        case tuple():
+            return tuple(absolute(entry, base) for entry in value)
+        case Section():
+            return value.model_copy(update={name: absolute(getattr(value, name), base) for name in type(value).model_fields})
+        case _:
+            return value
+
+
 def _quoted_line(text: str, message: str) -> str:
     found = _TOML_LINE.search(message)
     return f": {text.splitlines()[int(found.group(1)) - 1].strip()}" if found else ""

@@ -9,7 +9,7 @@ from dbc.can_io import INTERFACES
 from dbc.catalogue import NAVIGATION, ROBOTS
 from dbc.errors import UserMistake
 from dbc.realtime import GATEWAY_PRIORITY
-from dbc.section import Section, between, checked, misfit, read_toml
+from dbc.section import Section, absolute, between, checked, misfit, read_toml
 from gateway.channel import ControlPath, control_path
 from gateway.limits import PROFILES
 from gateway.record.files import BusFormat
@@ -215,18 +215,5 @@ def make_rig(origin: Path, tree: dict[str, Any], base: Path) -> Rig:
     Raises:
         RigError: unknown or missing key, value out of range; one line per mistake.
     """
-    rig: Rig = _absolute(checked(origin, tree, Rig, RigError), base)
+    rig: Rig = absolute(checked(origin, tree, Rig, RigError), base)
     return rig
-
-
-def _absolute(value: Any, base: Path) -> Any:  # noqa: ANN401 - any part of a section
-    """The same with every path absolute."""
-    match value:
-        case Path():
-            return base / value
-        case tuple():
-            return tuple(_absolute(entry, base) for entry in value)
-        case Section():
-            return value.model_copy(update={name: _absolute(getattr(value, name), base) for name in type(value).model_fields})
-        case _:
-            return value

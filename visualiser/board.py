@@ -29,9 +29,14 @@ class Received:
 
 
 class Board:
-    """Keeps one sample per topic; what is not a sample is counted and forgotten."""
+    """Keeps one sample per topic; what is not a sample is counted and forgotten.
 
-    def __init__(self) -> None:
+    Args:
+        is_clock_shared: whether who sends and who receives are one host.
+    """
+
+    def __init__(self, is_clock_shared: bool = True) -> None:
+        self._is_clock_shared = is_clock_shared
         self.newest: dict[str, Received] = {}
         self.rejected = 0
 
@@ -48,14 +53,14 @@ class Board:
     def age_ms(self, topic: str, now_ns: int) -> float:
         """Age of the newest sample of a topic [ms].
 
-        The sender's clock is ours (one host), so that a sample that waited in a socket shows its true age. Lockstep stages
-        run in virtual time: there the age counts from arrival.
+        Where the sender's clock is ours, a sample that waited in a socket shows its true age. From another machine, and from
+        lockstep stages, which run in virtual time, the age counts from arrival.
 
         Raises:
             KeyError: nothing of this topic has come yet.
         """
         received = self.newest[topic]
-        born_ns = received.received_ns if self._is_lockstep() else received.sample.t_ns
+        born_ns = received.sample.t_ns if self._is_clock_shared and not self._is_lockstep() else received.received_ns
         return max(0.0, (now_ns - born_ns) * 1e-6)
 
     def is_lost(self, topic: str, now_ns: int) -> bool:

@@ -17,7 +17,7 @@ from aiohttp import WSCloseCode, web
 from aiohttp.typedefs import Handler
 
 from dbc.errors import SetupFailure
-from gateway.telemetry import DEFAULT_BASE_PORT, TOPICS, Sample, Subscriber
+from gateway.telemetry import DEFAULT_BASE_PORT, TOPICS, Sample, Subscriber, TlsSection
 from visualiser.board import Board
 
 DEFAULT_PORT = 8080
@@ -47,10 +47,12 @@ class ViewOptions:
     Args:
         port: TCP port of the page on the loopback interface.
         telemetry_base_port: first telemetry port of the processes to look at.
+        tls: for a rig that is another machine; None for this one.
     """
 
     port: int = DEFAULT_PORT
     telemetry_base_port: int = DEFAULT_BASE_PORT
+    tls: TlsSection | None = None
 
     @property
     def url(self) -> str:
@@ -80,8 +82,8 @@ class Frame(msgspec.Struct, frozen=True):
 class Bridge:
     """The board, the browsers that look at it, and the web application between them. All of it lives on one event loop."""
 
-    def __init__(self) -> None:
-        self._board = Board()
+    def __init__(self, is_clock_shared: bool = True) -> None:
+        self._board = Board(is_clock_shared)
         self._wakes: set[asyncio.Event] = set()
         self._sockets: set[web.WebSocketResponse] = set()
         self._encoder = msgspec.json.Encoder()
@@ -173,7 +175,7 @@ async def _listen(runner: web.AppRunner, port: int) -> None:
 
 
 async def _serve(options: ViewOptions, stop: threading.Event) -> None:
-    bridge = Bridge()
+    bridge = Bridge(is_clock_shared=options.tls is None)
     runner = web.AppRunner(bridge.application(), access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     loop = asyncio.get_running_loop()
@@ -183,7 +185,7 @@ async def _serve(options: ViewOptions, stop: threading.Event) -> None:
 
     try:
         await _listen(runner, options.port)
-        with Subscriber(on_sample, list(TOPICS), options.telemetry_base_port):
+        with Subscriber(on_sample, list(TOPICS), options.telemetry_base_port, options.tls):
             while not stop.is_set():
                 await asyncio.sleep(_STOP_POLL_S)
     finally:

@@ -21,6 +21,7 @@ from gateway.telemetry import (
     StateSample,
     StatusSample,
     Subscriber,
+    TlsSection,
     WorldSample,
 )
 from visualiser.board import Board
@@ -48,9 +49,11 @@ class WatchOptions:
 
     Args:
         telemetry_base_port: first telemetry port of the processes to look at.
+        tls: for a rig that is another machine; None for this one.
     """
 
     telemetry_base_port: int = DEFAULT_BASE_PORT
+    tls: TlsSection | None = None
 
 
 def _newest(board: Board, topic: str, kind: type[SampleT]) -> SampleT | None:
@@ -181,7 +184,7 @@ def _scenario(board: Board) -> str:
 
 def run(options: WatchOptions, stop: threading.Event) -> None:
     """Show telemetry until `stop` is set."""
-    board = Board()
+    board = Board(is_clock_shared=options.tls is None)
     lock = threading.Lock()
     console = Console()
 
@@ -189,7 +192,7 @@ def run(options: WatchOptions, stop: threading.Event) -> None:
         with lock:
             board.accept(topic, payload, time.monotonic_ns())
 
-    with Subscriber(on_sample, list(TOPICS), options.telemetry_base_port):
+    with Subscriber(on_sample, list(TOPICS), options.telemetry_base_port, options.tls):
         if not console.is_terminal:
             while not stop.wait(_LINE_PERIOD_S):
                 with lock:

@@ -26,12 +26,14 @@ from xil.cli_common import (
     MappingOption,
     PortOption,
     RigOption,
+    TlsOption,
     VehicleOption,
     exit_code_of,
     refuse_beside_rig,
     run_daemon,
     show,
     stop_on_signal,
+    tls_of,
 )
 from xil.scenario import Stage
 
@@ -220,11 +222,14 @@ def bus_hub(
 
 @app.command()
 def view(
-    port: Annotated[int, typer.Option(min=1024, max=65535, help="port of the page")] = 8080, telemetry_port: PortOption = DEFAULT_BASE_PORT
+    port: Annotated[int, typer.Option(min=1024, max=65535, help="port of the page")] = 8080,
+    telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    tls: TlsOption = None,
 ) -> None:
     """Serve the virtual world to a browser."""
+    section = tls_of(tls)
     print(f"http://127.0.0.1:{port}/", flush=True)
-    run_daemon("visualiser.bridge", lambda m: m.ViewOptions(port=port, telemetry_base_port=telemetry_port))
+    run_daemon("visualiser.bridge", lambda m: m.ViewOptions(port=port, telemetry_base_port=telemetry_port, tls=section))
 
 
 @app.command()

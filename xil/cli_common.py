@@ -9,11 +9,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from dbc.errors import SetupFailure, UserMistake
+
+if TYPE_CHECKING:
+    from gateway.telemetry import TlsSection
 
 EXIT_FAIL, EXIT_USER, EXIT_SETUP, EXIT_INTERRUPTED = 1, 2, 3, 130
 
@@ -21,6 +24,9 @@ DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat f
 MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML file of the names and units that a site's DBC has for ours")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
 PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
+TlsOption = Annotated[
+    Path | None, typer.Option("--tls", help="TOML file: address of a rig that is another machine, and this side's certificate")
+]
 ControlOption = Annotated[
     Path | None, typer.Option("--control", help="directory of the control sockets and their key; default: one of the user's own")
 ]
@@ -50,6 +56,17 @@ def run_daemon(module: str, make_options: Callable[[Any], object]) -> None:
     daemon = importlib.import_module(module)
     with stop_on_signal() as stop:
         daemon.run(make_options(daemon), stop)
+
+
+def tls_of(path: Path | None) -> "TlsSection | None":
+    """How a rig on another machine is reached, where a file says so.
+
+    Raises:
+        TlsMistake: see `gateway.telemetry.read_tls`.
+    """
+    from gateway.telemetry import read_tls  # noqa: PLC0415
+
+    return None if path is None else read_tls(path)
 
 
 def exit_code_of(error: UserMistake | SetupFailure) -> int:

@@ -14,11 +14,13 @@ from xil.cli_common import (
     KeyOption,
     PortOption,
     RigOption,
+    TlsOption,
     as_json_text,
     refuse_beside_rig,
     run_daemon,
     show,
     stop_on_signal,
+    tls_of,
 )
 
 live = typer.Typer()
@@ -87,9 +89,10 @@ def make_key(file: Annotated[Path, typer.Argument(metavar="FILE", help="not ther
 
 
 @live.command()
-def watch(telemetry_port: PortOption = DEFAULT_BASE_PORT) -> None:
+def watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, tls: TlsOption = None) -> None:
     """A live table of what runs."""
-    run_daemon("visualiser.watch", lambda m: m.WatchOptions(telemetry_base_port=telemetry_port))
+    section = tls_of(tls)
+    run_daemon("visualiser.watch", lambda m: m.WatchOptions(telemetry_base_port=telemetry_port, tls=section))
 
 
 @live.command("object")
@@ -126,21 +129,22 @@ def lift(
 
 
 @params.command("list")
-def params_list(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+def params_list(telemetry_port: PortOption = DEFAULT_BASE_PORT, tls: TlsOption = None, as_json: JsonOption = False) -> None:
     """All parameters with value, unit, range and default."""
-    params_get([], telemetry_port, as_json)
+    params_get([], telemetry_port, tls, as_json)
 
 
 @params.command("get")
 def params_get(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="parameters; `params list` has them all")],
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    tls: TlsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Some parameters."""
     from xil import params as tuner  # noqa: PLC0415
 
-    answer = tuner.values(names, telemetry_port)
+    answer = tuner.values(names, telemetry_port, tls_of(tls))
     show(answer if as_json else tuner.values_table(answer), as_json)
 
 
@@ -148,12 +152,13 @@ def params_get(
 def params_set(
     assignments: Annotated[list[str], typer.Argument(metavar="NAME=VALUE...", help="for example planner.safe_time_s=1.8")],
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    tls: TlsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Change parameters between two cycles: all that are named, or none when one is refused."""
     from xil import params as tuner  # noqa: PLC0415
 
-    answer = tuner.change(assignments, telemetry_port)
+    answer = tuner.change(assignments, telemetry_port, tls_of(tls))
     show(answer if as_json else tuner.changes_table(answer), as_json)
 
 
@@ -161,31 +166,34 @@ def params_set(
 def params_revert(
     what: Annotated[str, typer.Argument(help="number of a change, last or all")] = "last",
     telemetry_port: PortOption = DEFAULT_BASE_PORT,
+    tls: TlsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Take a change back: the parameters that it set get the values from before."""
     from xil import params as tuner  # noqa: PLC0415
 
-    answer = tuner.revert(what, telemetry_port)
+    answer = tuner.revert(what, telemetry_port, tls_of(tls))
     show(answer if as_json else tuner.changes_table(answer), as_json)
 
 
 @params.command("history")
-def params_history(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+def params_history(telemetry_port: PortOption = DEFAULT_BASE_PORT, tls: TlsOption = None, as_json: JsonOption = False) -> None:
     """Who changed what, and when."""
     from xil import params as tuner  # noqa: PLC0415
 
-    answer = tuner.history(telemetry_port)
+    answer = tuner.history(telemetry_port, tls_of(tls))
     show(answer if as_json else tuner.history_table(answer), as_json)
 
 
 @params.command("watch")
-def params_watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, as_json: JsonOption = False) -> None:
+def params_watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, tls: TlsOption = None, as_json: JsonOption = False) -> None:
     """Print every change as it comes in force, until interrupted."""
     from xil import params as tuner  # noqa: PLC0415
 
     with stop_on_signal() as stop:
-        tuner.follow(telemetry_port, stop, lambda sample: print(as_json_text(sample) if as_json else tuner.line(sample), flush=True))
+        tuner.follow(
+            telemetry_port, stop, lambda sample: print(as_json_text(sample) if as_json else tuner.line(sample), flush=True), tls_of(tls)
+        )
 
 
 @fault.command("add")

@@ -15,7 +15,7 @@ from rich.text import Text
 from controller.parameters import Accepted, Refused
 from controller.tuning import Answer, GetRequest, History, HistoryRequest, ListRequest, Request, RevertRequest, SetRequest, Values, request
 from dbc.errors import SetupFailure, UserMistake
-from gateway.telemetry import ParameterChange, ParametersSample, Subscriber, decode
+from gateway.telemetry import ParameterChange, ParametersSample, Subscriber, TlsSection, decode
 
 AnswerT = TypeVar("AnswerT", bound=Answer)
 
@@ -24,27 +24,27 @@ class ParameterMistake(UserMistake):
     """A request that is none, or that the controller refuses; one line per reason."""
 
 
-def values(names: list[str], base_port: int) -> Values:
+def values(names: list[str], base_port: int, tls: TlsSection | None = None) -> Values:
     """The named parameters of the controller that runs on these ports; all of them, when none is named.
 
     Raises:
         ParameterMistake: there is no such parameter.
         TelemetryError: no controller answers.
     """
-    return _asked(GetRequest(names=names) if names else ListRequest(), Values, base_port)
+    return _asked(GetRequest(names=names) if names else ListRequest(), Values, base_port, tls)
 
 
-def change(assignments: list[str], base_port: int) -> Accepted:
+def change(assignments: list[str], base_port: int, tls: TlsSection | None = None) -> Accepted:
     """Set parameters, each given as `NAME=VALUE`: all of them, or none when one is refused.
 
     Raises:
         ParameterMistake: one of them is not that, or is refused.
         TelemetryError: no controller answers.
     """
-    return _asked(SetRequest(changes=parsed(assignments), who=_who()), Accepted, base_port)
+    return _asked(SetRequest(changes=parsed(assignments), who=_who()), Accepted, base_port, tls)
 
 
-def revert(what: str, base_port: int) -> Accepted:
+def revert(what: str, base_port: int, tls: TlsSection | None = None) -> Accepted:
     """Take back a change by its number, the `last` that stands, or `all`.
 
     Raises:
@@ -59,19 +59,21 @@ def revert(what: str, base_port: int) -> Accepted:
             chosen = int(number)
         case _:
             raise ParameterMistake(f"revert {what!r}: the number of a change, last or all")
-    return _asked(RevertRequest(what=chosen, who=_who()), Accepted, base_port)
+    return _asked(RevertRequest(what=chosen, who=_who()), Accepted, base_port, tls)
 
 
-def history(base_port: int) -> History:
+def history(base_port: int, tls: TlsSection | None = None) -> History:
     """The audit trail.
 
     Raises:
         TelemetryError: no controller answers.
     """
-    return _asked(HistoryRequest(), History, base_port)
+    return _asked(HistoryRequest(), History, base_port, tls)
 
 
-def follow(base_port: int, stop: threading.Event, tell: Callable[[ParametersSample], None]) -> None:
+def follow(
+    base_port: int, stop: threading.Event, tell: Callable[[ParametersSample], None], tls: TlsSection | None = None
+) -> None:
     """Tell every change that comes in force, until `stop` is set.
 
     Raises:
@@ -82,8 +84,8 @@ def follow(base_port: int, stop: threading.Event, tell: Callable[[ParametersSamp
         if isinstance(sample := decode(topic, payload), ParametersSample):
             tell(sample)
 
-    values([], base_port)
-    with Subscriber(on_sample, ["parameters"], base_port):
+    values([], base_port, tls)
+    with Subscriber(on_sample, ["parameters"], base_port, tls):
         stop.wait()
 
 
@@ -108,8 +110,8 @@ def parsed(assignments: list[str]) -> dict[str, float]:
     return changes
 
 
-def _asked(content: Request, kind: type[AnswerT], base_port: int) -> AnswerT:
-    answer = request(content, base_port)
+def _asked(content: Request, kind: type[AnswerT], base_port: int, tls: TlsSection | None) -> AnswerT:
+    answer = request(content, base_port, tls)
     if isinstance(answer, Refused):
         raise ParameterMistake("\n".join(answer.reasons))
     if not isinstance(answer, kind):

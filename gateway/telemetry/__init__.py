@@ -23,7 +23,6 @@ import msgspec
 import zenoh
 
 from dbc.errors import SetupFailure
-from gateway.keys import check_secret
 from gateway.telemetry.samples import (
     MAX_SAMPLE_BYTES,
     TOPICS,
@@ -48,7 +47,7 @@ from gateway.telemetry.samples import (
     port_of,
     topic_of,
 )
-from gateway.telemetry.security import KEY_PREFIX, TlsSection, connecting_options, listening_options
+from gateway.telemetry.security import KEY_PREFIX, TlsSection, check_files, connecting_options, listening_options, read_tls
 
 __all__ = [
     "DEFAULT_BASE_PORT",
@@ -81,6 +80,7 @@ __all__ = [
     "decode",
     "new_boot_id",
     "port_of",
+    "read_tls",
     "topic_of",
 ]
 
@@ -134,7 +134,7 @@ def _listening(source: Source, port: int, tls: TlsSection | None) -> zenoh.Sessi
         raise TelemetryError(
             f"telemetry port {port} of the {source} is busy; is another run active? Choose another with --telemetry-port"
         ) from error
-    check_secret(tls.private_key)
+    check_files(tls)
     try:
         return _session([local, tls.endpoint(source)], [], listening_options(tls))
     except zenoh.ZError as error:
@@ -221,6 +221,9 @@ class Subscriber:
 
     Args:
         tls: for a rig that is another machine.
+
+    Raises:
+        UserMistake: a certificate or the key cannot be used.
     """
 
     def __init__(
@@ -234,6 +237,7 @@ class Subscriber:
         if tls is None:
             self._session = _session([], [f"tcp/127.0.0.1:{port_of(source, base_port)}" for source in sources])
         else:
+            check_files(tls)
             self._session = _session([], [tls.endpoint(source) for source in sources], connecting_options(tls))
 
         def receive(topic: str) -> "zenoh.handlers.Callback[zenoh.Sample]":
@@ -272,9 +276,12 @@ def ask(
         tls: for a rig that is another machine.
 
     Raises:
+        UserMistake: a certificate or the key cannot be used.
         TelemetryError: the process does not run, does not answer in time, or does not take the request.
     """
     port = port_of(source, base_port)
+    if tls is not None:
+        check_files(tls)
     deadline_s = time.monotonic() + timeout_s
     try:
         if tls is None:

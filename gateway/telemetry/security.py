@@ -10,7 +10,9 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field
 
-from dbc.section import Section, misfit
+from dbc.errors import UserMistake
+from dbc.section import Section, absolute, misfit, read_section
+from gateway.keys import check_secret
 from gateway.telemetry.samples import Source, port_of
 
 KEY_PREFIX = "xilgate"
@@ -55,10 +57,39 @@ class TlsSection(Section):
         return f"tls/{host}:{port_of(source, int(port))}"
 
 
+class TlsMistake(UserMistake):
+    """A file with a `TlsSection` cannot be used; one line per mistake, each with file, key, value and what is allowed."""
+
+
+def read_tls(path: Path) -> TlsSection:
+    """Read how a reader reaches a rig that is another machine. Files that it names without a leading slash are relative to it.
+
+    Raises:
+        TlsMistake: missing file, malformed TOML, unknown or missing key, value out of range.
+    """
+    section: TlsSection = absolute(read_section(path, TlsSection, TlsMistake), path.absolute().parent)
+    return section
+
+
 def listening_options(tls: TlsSection) -> Mapping[str, Any]:
     """Settings of Zenoh for the side of the rig."""
     files = {"listen_certificate": str(tls.certificate), "listen_private_key": str(tls.private_key)}
     return {"transport/link/tls": _verified(tls) | files, "access_control": _access(tls)}
+
+
+def check_files(tls: TlsSection) -> None:
+    """Look at the files before Zenoh does: it would try for ever to connect with what it cannot read.
+
+    Raises:
+        TlsMistake: a certificate cannot be read.
+        KeyMistake: the private key cannot, or others can.
+    """
+    for path in (tls.certificate, tls.authority):
+        try:
+            path.read_bytes()
+        except OSError as error:
+            raise TlsMistake(f"{path}: {error.strerror}") from error
+    check_secret(tls.private_key)
 
 
 def connecting_options(tls: TlsSection) -> Mapping[str, Any]:

@@ -50,6 +50,13 @@ def test_age_counts_from_the_making_of_a_sample_not_from_its_arrival() -> None:
     assert board.age_ms("state", 400 * MS) == pytest.approx(300.0)
 
 
+def test_from_another_machine_age_counts_from_arrival_since_its_clock_is_another() -> None:
+    board = Board(is_clock_shared=False)
+    board.accept("state", encoded("state", 10**15), now_ns=350 * MS)
+    assert board.age_ms("state", 400 * MS) == pytest.approx(50.0)
+    assert board.is_lost("state", 900 * MS)
+
+
 def test_age_is_never_negative() -> None:
     board = Board()
     board.accept("state", encoded("state", 100 * MS), now_ns=90 * MS)

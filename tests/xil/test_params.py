@@ -14,8 +14,10 @@ from controller.planning.options import PlannerOptions
 from controller.problem import OcpOptions
 from controller.samples import parameters_sample
 from controller.tuning import SERVICE, TuningService
-from gateway.telemetry import Publisher, Source, TelemetryError
-from tests.support.processes import free_base_port, wait_until, xilgate
+from gateway.telemetry import CommandSample, Publisher, Source, TelemetryError, read_tls
+from tests.support.certificates import make_authority, make_certificate
+from tests.support.processes import end, free_base_port, start_xilgate, wait_until, xilgate
+from tests.visualiser.feeder import samples_at
 from xil import params
 
 SAFE_TIME = "planner.safe_time_s"
@@ -33,6 +35,21 @@ def controller():
 @pytest.fixture
 def port(controller):
     return controller[2]
+
+
+@pytest.fixture
+def remote(tmp_path):
+    """A controller that a reader and a tuner reach with TLS; the files that say how."""
+    authority = make_authority(tmp_path, "ours")
+    base_port = free_base_port()
+    address = f"127.0.0.1:{base_port + 7000 if base_port < 50_000 else base_port - 7000}"
+    for name in ("rig", "reader", "tuner"):
+        make_certificate(tmp_path, name, authority)
+        files = f'certificate = "{name}.pem"\nprivate_key = "{name}.key"\nauthority = "ours.pem"\n'
+        (tmp_path / f"{name}.toml").write_text(f'address = "{address}"\n{files}writers = ["tuner"]\n')
+    with Publisher(Source.CONTROLLER, base_port, read_tls(tmp_path / "rig.toml")) as publisher:
+        publisher.serve(SERVICE, TuningService(ParameterStore(OcpOptions(), PlannerOptions())).answer)
+        yield publisher, {name: str(tmp_path / f"{name}.toml") for name in ("reader", "tuner")}
 
 
 def shown(table, width=200):
@@ -139,3 +156,38 @@ def test_the_commands_without_a_controller():
     (line,) = finished.stderr.splitlines()
     assert str(port + 1) in line
     assert "--telemetry-port" in line
+
+
+@pytest.mark.req("S1")
+def test_a_rig_that_is_another_machine_is_tuned_by_its_writers_and_watched_by_its_readers(remote, tmp_path):
+    publisher, files = remote
+    tuned = xilgate("params", "set", f"{SAFE_TIME}=1.9", "--tls", files["tuner"])
+    assert tuned.returncode == 0, tuned.stderr
+    refused = xilgate("params", "set", f"{SAFE_TIME}=1.7", "--tls", files["reader"])
+    assert (refused.returncode, len(refused.stderr.splitlines())) == (3, 1)
+    assert "1.9" in xilgate("params", "get", SAFE_TIME, "--tls", files["tuner"]).stdout
+
+    watching = start_xilgate("watch", "--tls", files["reader"])
+    try:
+        seen = []
+        reading = threading.Thread(target=lambda: seen.extend(iter(watching.stdout.readline, "")), daemon=True)
+        reading.start()
+
+        def is_seen():
+            publisher.post(next(sample for sample in samples_at(3.0, 1, 1) if isinstance(sample, CommandSample)))
+            return any("command OK" in line for line in seen)
+
+        wait_until(is_seen, 20, "a command of the rig")
+        assert "lost" not in seen[-1]  # the clock of another machine says nothing about age
+    finally:
+        end(watching)
+
+    mistaken = tmp_path / "mistaken.toml"
+    mistaken.write_text('address = "127.0.0.1:7547"\ncertificate = "none.pem"\nprivate_key = "none.key"\n')
+    for command in (["watch"], ["view"], ["params", "list"]):
+        finished = xilgate(*command, "--tls", str(mistaken))
+        assert (finished.returncode, finished.stderr) == (2, f"xilgate: {mistaken}: authority: missing\n")
+    mistaken.write_text(mistaken.read_text() + 'authority = "none.pem"\n')
+    for command in (["watch"], ["params", "list"]):
+        finished = xilgate(*command, "--tls", str(mistaken))
+        assert (finished.returncode, finished.stderr) == (2, f"xilgate: {tmp_path}/none.pem: No such file or directory\n")
