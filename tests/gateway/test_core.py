@@ -18,7 +18,7 @@ from gateway.causes import Cause, Finding
 from gateway.conditions import Surroundings
 from gateway.core import ENGAGE_GRACE_NS, TICK_NS, GatewayCore
 from gateway.limits import LIFTED, PROVING_GROUND
-from gateway.messages import CommandStatus, Mode, Operation
+from gateway.messages import CommandStatus, Mode, Operation, OperatorRequest
 from tests.support.drive import GatewayDrive
 
 
@@ -479,6 +479,13 @@ def test_what_the_operator_ends_is_told_as_his_doing():
         drive.tick()
         assert drive.core.disengagement.finding == Finding(cause, 1, 0, "operator") == drive.output.transition.finding
         assert drive.core.disengagement.t_ns == drive.now_ns
+
+
+def test_a_stop_that_its_own_process_asks_for_is_told_as_that():
+    drive = engaged()
+    drive._to_send = OperatorRequest(drive.output.state.boot_id, 1, Operation.STOP, drive.now_ns)
+    drive.tick()
+    assert drive.core.disengagement.finding == Finding(Cause.OPERATOR_STOP, 1, 0, "the gateway is to end")
 
 
 def test_only_the_end_of_an_engagement_is_a_disengagement():
