@@ -131,10 +131,10 @@ class Catalogue:
             math.inf if found.maximum is None else float(found.maximum),
         )
 
-    def resolution(self, name: str, signal: str) -> float:
-        """Smallest step of a signal, in the unit of the DBC; 0 for one in floating point."""
+    def resolution(self, name: str, signal: str) -> tuple[float, float]:
+        """Smallest step of a signal and one value that it can have, in the unit of the DBC; the step is 0 in floating point."""
         found = self._messages[name].get_signal_by_name(signal)
-        return 0.0 if found.is_float else abs(float(found.scale))
+        return 0.0 if found.is_float else abs(float(found.scale)), float(found.offset)
 
     def enumeration(self, name: str, signal: str) -> dict[str, int]:
         """Value table of a signal: entry name to raw value."""

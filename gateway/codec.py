@@ -1,14 +1,14 @@
 """Bus values to SI and back: the only module of the gateway that knows message and signal names, degrees and per cent."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from dbc.catalogue import Catalogue, CatalogueError, EncodeError
 from dbc.e2e import E2EProtector
 from dbc.frame import CanFrame
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
-from gateway.limits import COARSEST, Demand, Resolution
+from gateway.limits import Demand, Resolution
 from gateway.messages import Mode
 from gateway.modes import DRIVING
 
@@ -175,12 +175,32 @@ class Codec:
     def _resolution(self) -> Resolution:
         steps: dict[str, float] = {}
         for demand, (name, signal, unit) in _DEMANDS.items():
-            step, coarsest = self._catalogue.resolution(name, signal), getattr(COARSEST, demand) / unit
-            if step > coarsest:
-                raise EncodeError(f"{name}.{signal}: steps of {step:.4g}, allowed: up to {coarsest:.4g}")
-            if step:  # in floating point our own are fine enough
-                steps[demand] = step * unit
+            step, offset = self._catalogue.resolution(name, signal)
+            if not step:  # in floating point our own are fine enough
+                continue
+            if abs(math.remainder(offset, step)) > _ROUNDING * step:
+                raise EncodeError(f"{name}.{signal}: steps of {step:.6g} from {offset:.6g} do not meet 0")
+            steps[demand] = step * unit
         return Resolution(**steps)
+
+    def check_resolution(self, coarsest: Resolution, reason: str) -> None:
+        """Refuse a DBC whose steps are too coarse.
+
+        Args:
+            coarsest: steps that are allowed.
+            reason: who does not allow more, for the message.
+
+        Raises:
+            CatalogueError: a step is larger; one line for all of them.
+        """
+        steps, allowed = asdict(self.resolution), asdict(coarsest)
+        wrong = [
+            f"{name}.{signal}: steps of {steps[demand] / unit:.4g}, {reason} up to {allowed[demand] / unit:.4g}"
+            for demand, (name, signal, unit) in _DEMANDS.items()
+            if steps[demand] > allowed[demand]
+        ]
+        if wrong:
+            raise CatalogueError(f"{', '.join(self._catalogue.sha256)}: {'; '.join(wrong)}")
 
     def update(self, measurement: Measurement, values: dict[str, dict[str, float]]) -> None:
         """Take the newest values of each message into the measurement."""
@@ -272,6 +292,8 @@ _DEMANDS = {
     "brake_norm": ("BR_Command", "PositionCommand", 0.01),
 }
 """The signal of each demand, and its unit in SI."""
+_ROUNDING = 1e-6
+"""Part of a step by which decimal factors and offsets may miss each other as floats."""
 
 _REHEARSAL_NS = 0
 _REHEARSED_DEMAND = Demand(0.0, 0.0, 0.0)

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from dbc.catalogue import Catalogue
+from dbc.catalogue import Catalogue, CatalogueError
 from dbc.frame import CanFrame
 from dbc.vehicle import Vehicle
 from gateway.actuation import Actuation
 from gateway.causes import Cause, Disengagement, Finding
-from gateway.codec import NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, RobotLimits
+from gateway.codec import COMMAND_MESSAGES, MONITOR_MESSAGES, NEEDED_MESSAGES, Codec, Cycle, Measurement, Monitors, RobotLimits
 from gateway.commands import MAX_STATE_LAG, CommandGate
 from gateway.conditions import (
     COMMAND_TIMEOUT_NS,
@@ -28,9 +28,10 @@ from gateway.conditions import (
     untimely,
 )
 from gateway.latency import LatencyChain
-from gateway.limits import PROVING_GROUND, Demand, LimitProfile
+from gateway.limits import PROVING_GROUND, Demand, LimitProfile, coarsest
 from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest, VehicleState
 from gateway.modes import DRIVING, QUIET, REACTIONS, TRANSITIONS, ModeMachine, Transition, Trigger
+from gateway.pacing import PULL_NS
 from gateway.plausibility import Plausibility
 from gateway.safe_stop import SafeStop, plan_index
 from gateway.supervision import Supervisor
@@ -43,6 +44,7 @@ ROBOT_SPEED_MARGIN = 1.1
 ENGAGE_GRACE_NS = 200_000_000
 """Time that the robots have to follow into Engaged [ns]."""
 
+_SHORTEST_TICK_S = (TICK_NS - PULL_NS) * 1e-9
 _REMEMBERED_STATES = MAX_STATE_LAG + 1
 """States that a command may answer."""
 _TIME_MESSAGE = "MilliTime"
@@ -69,8 +71,24 @@ class StepOutput:
     reply: OperatorReply | None
 
 
+def _check_cycles(catalogue: Catalogue) -> None:
+    """Refuse cycle times at which the gateway does not send: its commands with every step, its monitors together, with every so many."""
+    ticks = max(catalogue.by_name["GW_Status"].cycle_time_ns // TICK_NS, 1)
+    allowed_ns = dict.fromkeys(COMMAND_MESSAGES, TICK_NS) | dict.fromkeys(MONITOR_MESSAGES, ticks * TICK_NS)
+    wrong = [
+        f"{name}: cycle time {catalogue.by_name[name].cycle_time_ns * 1e-6:g} ms, allowed: {cycle_ns * 1e-6:g} ms"
+        for name, cycle_ns in allowed_ns.items()
+        if catalogue.by_name[name].cycle_time_ns != cycle_ns
+    ]
+    if wrong:
+        raise CatalogueError(f"{', '.join(catalogue.sha256)}: {'; '.join(wrong)}")
+
+
 class GatewayCore:
     """One gateway.
+
+    Raises:
+        CatalogueError: the DBC files are not what it needs; one line.
 
     Attributes:
         measurement: what is known of the car and the robots.
@@ -85,6 +103,8 @@ class GatewayCore:
         self._wheel_radius_m = vehicle.model.wheel_radius_m
         self._boot_id = boot_id
         self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps, ROBOT_SPEED_MARGIN * profile.max_speed_mps))
+        self._codec.check_resolution(coarsest(vehicle, profile, _SHORTEST_TICK_S), f"limits {profile.name} allow")
+        _check_cycles(catalogue)
         self._navigation_timeout_ns = catalogue.by_name[_TIME_MESSAGE].timeout_ns
         self._monitor_ticks = catalogue.by_name["GW_Status"].cycle_time_ns // TICK_NS
         self._modes = ModeMachine()

@@ -18,6 +18,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from dbc.vehicle import Vehicle
+
 
 @dataclass(frozen=True, slots=True)
 class StopGrade:
@@ -134,9 +136,6 @@ class Resolution:
     brake_norm: float = 1e-4
 
 
-COARSEST = Resolution(steering_wheel_rad=math.radians(0.5), accelerator_norm=5e-3, brake_norm=5e-3)
-"""A step must be less than what the slowest rate of a profile allows in a tick, that of `bench`: 1 degree, 0.6 %, 2 %."""
-
 
 @dataclass(frozen=True, slots=True)
 class Demand:
@@ -157,6 +156,20 @@ STILL_MPS = 1.0
 
 _ROUNDING = 1e-9
 """Part of a step by which a product of floats may be off its multiple."""
+
+
+def coarsest(vehicle: Vehicle, profile: LimitProfile, tick_s: float) -> Resolution:
+    """The largest steps with which demands can move in every tick of that length [s] without exceeding a rate."""
+    wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
+    curvature_per_mps2 = 1.0 / profile.max_speed_mps**2
+    slope = 1.0 + (profile.lateral_acceleration_mps2 * wheelbase_m * curvature_per_mps2) ** 2  # of the tangent, where it is steepest
+    at_speed_rad = profile.lateral_jerk_mps3 * tick_s * wheelbase_m * curvature_per_mps2 / slope * vehicle.steering.ratio
+    force_per_s = vehicle.model.mass_kg * tick_s
+    return Resolution(
+        min(profile.steering_wheel_rate_radps * tick_s, at_speed_rad),
+        profile.drive_jerk_mps3 * force_per_s / vehicle.pedals.full_drive_force_n,
+        profile.brake_jerk_mps3 * force_per_s / vehicle.pedals.full_brake_force_n,
+    )
 
 
 def clamp(value: float, low: float, high: float) -> float:

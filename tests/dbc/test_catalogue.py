@@ -53,7 +53,7 @@ def test_a_signal_without_a_range_has_no_bounds(tmp_path):
 def test_a_signal_has_steps_or_is_in_floating_point(tmp_path):
     text = message("F : 0|32@1- (2,0) [0|0]", "N : 32|8@1- (-0.25,3) [0|0]", "W : 40|8@1- (3,0) [0|0]") + "SIG_VALTYPE_ 1 F : 1;\n"
     catalogue = load([written(tmp_path, text)])
-    assert [catalogue.resolution("X", signal) for signal in "FNW"] == [0.0, 0.25, 3.0]
+    assert [catalogue.resolution("X", signal) for signal in "FNW"] == [(0.0, 0.0), (0.25, 3.0), (3.0, 0.0)]
 
 
 def test_messages_that_are_needed_are_named():

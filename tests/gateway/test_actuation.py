@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from dbc.vehicle import FOCUS, load_vehicle
 from gateway.actuation import NEUTRAL, UNITS, Activation, Actuation
-from gateway.limits import BENCH, NOMINAL, PROFILES, PROVING_GROUND, Demand, Resolution
+from gateway.limits import BENCH, NOMINAL, PROFILES, PROVING_GROUND, Demand, Resolution, coarsest, lateral_acceleration_mps2
 
 TICK_NS, TICK_S = 10_000_000, 0.01
 CAR = load_vehicle()
@@ -479,6 +479,33 @@ def test_other_steps_of_the_bus():
         gate.follow(0.0, -1.0, 20.0, 0.0)
         assert math.remainder(gate.demand.brake_norm, 0.003) == pytest.approx(0.0, abs=1e-9)
     assert gate.demand.brake_norm > 0.1
+
+
+@pytest.mark.req("G1")
+@pytest.mark.parametrize("car", CARS)
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
+def test_the_coarsest_steps_that_are_allowed_keep_every_rate(profile, car):
+    vehicle = CARS[car]
+    wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
+    full_mps2 = vehicle.pedals.full_drive_force_n / vehicle.model.mass_kg
+    for speed_mps in (0.5 * profile.max_speed_mps, profile.max_speed_mps):
+        gate = Actuation(vehicle, profile, TICK_NS, coarsest(vehicle, profile, 0.006))
+        before_rad, before_mps2, moved = 0.0, 0.0, 0.0
+        for k in range(400):
+            elapsed_s = (0.006, 0.01)[k % 2]
+            gate.pass_time(round(elapsed_s * 1e9))
+            gate.follow(math.copysign(0.2, k % 200 - 100), math.copysign(1.0, 100 - k % 200), speed_mps, 0.0)
+            lateral_mps2 = [
+                lateral_acceleration_mps2(angle_rad / vehicle.steering.ratio, wheelbase_m, speed_mps)
+                for angle_rad in (before_rad, gate.demand.steering_wheel_rad)
+            ]
+            assert abs(lateral_mps2[1] - lateral_mps2[0]) <= profile.lateral_jerk_mps3 * elapsed_s + EPSILON
+            assert abs(gate.demand.steering_wheel_rad - before_rad) <= profile.steering_wheel_rate_radps * elapsed_s + EPSILON
+            drive_mps2 = gate.demand.accelerator_norm * full_mps2
+            assert drive_mps2 - before_mps2 <= profile.drive_jerk_mps3 * elapsed_s + EPSILON
+            moved = max(moved, abs(gate.demand.steering_wheel_rad))
+            before_rad, before_mps2 = gate.demand.steering_wheel_rad, drive_mps2
+        assert moved > 0.0
 
 
 # ---- no frame ever breaks a limit

@@ -84,40 +84,53 @@ def test_a_demand_beyond_the_range_of_a_site_becomes_the_nearest_in_it(tmp_path)
 
 
 STEPS = {
-    "steering_wheel_rad": ('AngleCommand : 16|16@1- (0.05,0) [-1080|1080] "deg" SR', "(0.05,", "SR_Command.AngleCommand"),
-    "accelerator_norm": ('PositionCommand : 16|16@1+ (0.01,0) [0|100] "%" AR', "(0.01,", "AR_Command.PositionCommand"),
-    "brake_norm": ('PositionCommand : 16|16@1+ (0.01,0) [0|100] "%" BR', "(0.01,", "BR_Command.PositionCommand"),
+    "steering_wheel_rad": ('AngleCommand : 16|16@1- (0.05,0) [-1080|1080] "deg" SR', "(0.05,0)", "SR_Command.AngleCommand"),
+    "accelerator_norm": ('PositionCommand : 16|16@1+ (0.01,0) [0|100] "%" AR', "(0.01,0)", "AR_Command.PositionCommand"),
+    "brake_norm": ('PositionCommand : 16|16@1+ (0.01,0) [0|100] "%" BR', "(0.01,0)", "BR_Command.PositionCommand"),
 }
 
 
-def dbc_with_step(tmp_path, demand, step):
+def dbc_with_step(tmp_path, demand, step, offset=0):
     line, ours, _ = STEPS[demand]
     text, site = ROBOTS_DBC.read_text(), tmp_path / "site.dbc"
     assert line in text
-    site.write_text(text.replace(line, line.replace(ours, f"({step},")))
+    site.write_text(text.replace(line, line.replace(ours, f"({step},{offset})")))
     return [site, GNSS_IMU_DBC]
 
 
 def test_demands_have_the_steps_of_the_dbc(tmp_path, monkeypatch):
     assert Codec(CATALOGUE, LIMITS).resolution == Resolution(math.radians(0.05), 1e-4, 1e-4)
-    for demand, step, expected in (
-        ("steering_wheel_rad", 0.5, math.radians(0.5)),
-        ("steering_wheel_rad", -0.2, math.radians(0.2)),
-        ("accelerator_norm", 0.5, 0.005),
-        ("brake_norm", 0.2, 0.002),
+    for demand, step, offset, expected in (
+        ("steering_wheel_rad", 0.5, 0, math.radians(0.5)),
+        ("steering_wheel_rad", -0.2, 0, math.radians(0.2)),
+        ("steering_wheel_rad", 0.1, -1080, math.radians(0.1)),
+        ("accelerator_norm", 0.5, -1, 0.005),
+        ("brake_norm", 0.2, 0, 0.002),
     ):
-        found = Codec(load(dbc_with_step(tmp_path, demand, step)), LIMITS).resolution
+        found = Codec(load(dbc_with_step(tmp_path, demand, step, offset)), LIMITS).resolution
         assert asdict(found) == pytest.approx(asdict(replace(Resolution(), **{demand: expected})))
     catalogue = load()
-    monkeypatch.setattr(catalogue, "resolution", lambda name, signal: 0.0)  # all in floating point
+    monkeypatch.setattr(catalogue, "resolution", lambda name, signal: (0.0, 0.3))  # all in floating point
     assert Codec(catalogue, LIMITS).resolution == Resolution()
 
 
 @pytest.mark.parametrize("demand", STEPS)
-def test_a_dbc_whose_steps_are_too_coarse_to_keep_rates_is_refused(tmp_path, demand):
-    files, signal = dbc_with_step(tmp_path, demand, 0.51), STEPS[demand][2]
-    with pytest.raises(CatalogueError, match=rf"^site\.dbc, gnss_imu\.dbc: .* {signal}: steps of 0\.51, allowed: up to 0\.5$"):
+@pytest.mark.parametrize(("step", "offset"), [(0.07, -0.1), (0.5, -0.25), (0.5, 0.001), (0.5, -0.001)])
+def test_a_dbc_on_whose_steps_no_demand_is_neutral_is_refused(tmp_path, demand, step, offset):
+    files, signal = dbc_with_step(tmp_path, demand, step, offset), STEPS[demand][2]
+    with pytest.raises(CatalogueError, match=rf"^site\.dbc, gnss_imu\.dbc: .* {signal}: steps of {step} from {offset} do not meet 0$"):
         Codec(load(files), LIMITS)
+
+
+def test_steps_that_are_too_coarse_are_refused_all_at_once():
+    codec().check_resolution(Resolution(math.radians(0.05), 1e-4, 1e-4), "nobody allows")
+    codec().check_resolution(Resolution(1.0, 1.0, 1.0), "nobody allows")
+    with pytest.raises(CatalogueError) as caught:
+        codec().check_resolution(Resolution(math.radians(0.04), 1e-4, 5e-5), "limits nominal allow")
+    assert str(caught.value) == (
+        "robots.dbc, gnss_imu.dbc: SR_Command.AngleCommand: steps of 0.05, limits nominal allow up to 0.04; "
+        "BR_Command.PositionCommand: steps of 0.01, limits nominal allow up to 0.005"
+    )
 
 
 def codec():

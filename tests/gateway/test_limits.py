@@ -3,11 +3,13 @@
 import dataclasses
 import math
 import re
+from dataclasses import replace
 
 import pytest
 
 from dbc.catalogue import load
 from dbc.frame import CanFrame
+from dbc.vehicle import FOCUS, load_vehicle
 from gateway import limits
 from gateway.limits import (
     BENCH,
@@ -19,6 +21,7 @@ from gateway.limits import (
     PROVING_GROUND,
     Resolution,
     clamp,
+    coarsest,
     lateral_acceleration_mps2,
     road_wheel_rad,
     steps_down,
@@ -87,6 +90,34 @@ def test_the_table_of_held_demands_is_what_the_limits_give(name):
     assert from_straight == pytest.approx(beside_m(lateral, profile.lateral_jerk_mps3, 0.25), rel=0.05)
     assert drive == profile.acceleration_mps2
     assert faster == pytest.approx(0.5 * drive, abs=0.051)
+
+
+@pytest.mark.parametrize("car", [FOCUS, FOCUS.with_name("van.toml")], ids=lambda path: path.stem)
+@pytest.mark.parametrize("profile", PROFILES.values(), ids=lambda profile: profile.name)
+def test_steps_are_too_coarse_when_one_of_them_exceeds_a_rate(car, profile):
+    vehicle, tick_s = load_vehicle(car), 0.006
+    steps = coarsest(vehicle, profile, tick_s)
+    wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
+    end_rad = road_wheel_rad(profile.lateral_acceleration_mps2, wheelbase_m, profile.max_speed_mps)
+    last_mps2 = profile.lateral_acceleration_mps2 - lateral_acceleration_mps2(
+        end_rad - steps.steering_wheel_rad / vehicle.steering.ratio, wheelbase_m, profile.max_speed_mps
+    )  # what the last step before the bound makes
+    rates = steps.steering_wheel_rad / tick_s / profile.steering_wheel_rate_radps, last_mps2 / tick_s / profile.lateral_jerk_mps3
+    assert max(rates) == pytest.approx(1.0, rel=1e-3)
+    assert max(rates) <= 1.0
+    forces_n = vehicle.pedals.full_drive_force_n, vehicle.pedals.full_brake_force_n
+    pedals = zip((steps.accelerator_norm, steps.brake_norm), forces_n, (profile.drive_jerk_mps3, profile.brake_jerk_mps3), strict=True)
+    for step_norm, force_n, jerk_mps3 in pedals:
+        assert step_norm * force_n / vehicle.model.mass_kg / tick_s == pytest.approx(jerk_mps3)
+    assert steps.steering_wheel_rad > Resolution().steering_wheel_rad
+    assert steps.accelerator_norm > Resolution().accelerator_norm
+
+
+def test_both_rates_can_be_what_makes_a_step_too_coarse():
+    vehicle = load_vehicle()
+    assert coarsest(vehicle, BENCH, 0.006).steering_wheel_rad < BENCH.steering_wheel_rate_radps * 0.006
+    slow = replace(BENCH, steering_wheel_rate_radps=0.5)
+    assert coarsest(vehicle, slow, 0.006).steering_wheel_rad == 0.5 * 0.006
 
 
 def test_resolution_is_that_of_the_robots_dbc():
