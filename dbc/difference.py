@@ -37,8 +37,8 @@ class Change:
 
 def compare(old: DbcFile, new: DbcFile) -> list[Change]:
     """All differences, those that break first."""
-    nodes = _renamed_nodes(old, new)
-    changes = [*_file(old, new), *(Change(True, "", "", "node", before, after) for before, after in nodes.items())]
+    nodes, senders = _renamed_nodes(old, new), {node for message in old.messages for node in message.senders}
+    changes = [*_file(old, new), *(Change(before in senders, "", "", "node", before, after) for before, after in nodes.items())]
     names = _counterparts(old.messages, new.messages, lambda message: message.frame_id)
     for before in old.messages:
         changes += _message(before, names[before.name], nodes)
@@ -55,10 +55,16 @@ def _file(old: DbcFile, new: DbcFile) -> Iterator[Change]:
 
 
 def _renamed_nodes(old: DbcFile, new: DbcFile) -> dict[str, str]:
-    """Nodes that are gone, each with the new one that sends and receives exactly what it did."""
+    """Nodes that are gone, each with the one new node that sends and receives exactly what it did."""
     before, after = _places(old), _places(new)
-    come = {frozenset(after[node]): node for node in after.keys() - before.keys()}
-    return {node: come[places] for node, found in before.items() if node not in after and (places := frozenset(found)) in come}
+    gone = [node for node in before if node not in after]
+    come = [node for node in after if node not in before]
+    places, new_places = [before[node] for node in gone], [after[node] for node in come]
+    return {
+        node: come[new_places.index(found)]
+        for node, found in zip(gone, places, strict=True)
+        if places.count(found) == 1 and new_places.count(found) == 1
+    }
 
 
 def _places(file: DbcFile) -> dict[str, set[tuple[int, int]]]:

@@ -15,7 +15,7 @@ from dbc.can_io import MAX_FRAMES_PER_RECEIVE, MAX_STANDARD_ID, Disturbable
 from dbc.can_link import SILENT_STATES, CanLink, LinkError
 from dbc.catalogue import NAVIGATION, ROBOTS, Catalogue
 from dbc.frame import CanFrame
-from dbc.health import LinkHealth
+from dbc.health import BusState, LinkHealth
 from dbc.traffic import Traffic
 
 __all__ = ["MAX_FRAMES_PER_RECEIVE", "BusSet", "CanLink", "Disturbable", "LinkError", "bus_names"]
@@ -130,8 +130,12 @@ class BusSet:
 
     @property
     def refusals(self) -> dict[str, str]:
-        """Why the last attempt to leave bus-off was refused, by network; for the log."""
-        return {network: link.refusal for network, link in self._by_network.items() if link.refusal}
+        """Why the last attempt to leave bus-off was refused, by network that is in bus-off."""
+        return {
+            network: link.refusal
+            for network, link in self._by_network.items()
+            if link.refusal and link.health().state is BusState.BUS_OFF
+        }
 
     @property
     def dropped(self) -> dict[str, int]:

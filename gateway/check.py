@@ -6,23 +6,23 @@ from typing import Any
 
 from dbc.errors import SetupFailure
 from dbc.link import CanLink, LinkError
-from gateway.keys import check_secret
 from gateway.preparation import Preparation, configuration
 from gateway.rig import Rig
+from gateway.telemetry import check_files
 
 
 def check_machine(rig: Rig) -> None:
     """Look for what would keep a gateway from starting on this machine; buses may still come.
 
     Raises:
-        KeyMistake: a key file is not usable.
+        UserMistake: a key file or a certificate is not usable.
         SetupFailure: a directory is missing or not writable; one line for each.
     """
     control = rig.control.path
     if rig.control.key is not None or control.key_file.exists():
         control.key()
     if rig.telemetry.tls is not None:
-        check_secret(rig.telemetry.tls.private_key)
+        check_files(rig.telemetry.tls)
     directories = {"control.directory": control.directory}
     if rig.recorder is not None:
         directories["recorder.directory"] = rig.recorder.directory

@@ -25,7 +25,7 @@ MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML file
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
 PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
 TlsOption = Annotated[
-    Path | None, typer.Option("--tls", help="TOML file: address of a rig that is another machine, and this side's certificate")
+    Path | None, typer.Option("--tls", help="instead of --telemetry-port: TOML file with address of another machine and our certificate")
 ]
 ControlOption = Annotated[
     Path | None, typer.Option("--control", help="directory of the control sockets and their key; default: one of the user's own")

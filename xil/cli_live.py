@@ -182,7 +182,7 @@ def params_history(telemetry_port: PortOption = DEFAULT_BASE_PORT, tls: TlsOptio
     from xil import params as tuner  # noqa: PLC0415
 
     answer = tuner.history(telemetry_port, tls_of(tls))
-    show(answer if as_json else tuner.history_table(answer), as_json)
+    show(answer if as_json else tuner.history_table(answer, tls is None), as_json)
 
 
 @params.command("watch")
@@ -192,7 +192,10 @@ def params_watch(telemetry_port: PortOption = DEFAULT_BASE_PORT, tls: TlsOption 
 
     with stop_on_signal() as stop:
         tuner.follow(
-            telemetry_port, stop, lambda sample: print(as_json_text(sample) if as_json else tuner.line(sample), flush=True), tls_of(tls)
+            telemetry_port,
+            stop,
+            lambda sample: print(as_json_text(sample) if as_json else tuner.line(sample, tls is None), flush=True),
+            tls_of(tls),
         )
 
 

@@ -84,7 +84,8 @@ def follow(
         if isinstance(sample := decode(topic, payload), ParametersSample):
             tell(sample)
 
-    values([], base_port, tls)
+    if tls is None:  # a reader of another machine may not use its services
+        values([], base_port)
     with Subscriber(on_sample, ["parameters"], base_port, tls):
         stop.wait()
 
@@ -146,20 +147,21 @@ def changes_table(answer: Accepted) -> Table | Text:
     return table
 
 
-def history_table(answer: History) -> Table:
-    """The audit trail for people, oldest change first."""
+def history_table(answer: History, is_clock_shared: bool = True) -> Table:
+    """The audit trail for people, oldest change first; without times where the controller's clock is that of another machine."""
     table = _table(f"parameters, version {answer.version}", "version", "time", "who", "takes back", "name", "old", "new")
     for entry in answer.entries:
-        taken_back = ", ".join(map(str, entry.reverts))
-        _add_changes(table, entry.changes, str(entry.version), _time_of_day(entry.accepted_ns), entry.who, taken_back)
+        taken_back, time_of_day = ", ".join(map(str, entry.reverts)), _time_of_day(entry.accepted_ns) if is_clock_shared else ""
+        _add_changes(table, entry.changes, str(entry.version), time_of_day, entry.who, taken_back)
     return table
 
 
-def line(sample: ParametersSample) -> str:
-    """One change in one line."""
+def line(sample: ParametersSample, is_clock_shared: bool = True) -> str:
+    """One change in one line, with its time, or that of its arrival where the controller's clock is that of another machine."""
     taken_back = f" takes back {', '.join(map(str, sample.reverts))}:" if sample.reverts else ""
     changes = ", ".join(f"{one.name} {one.old:g} -> {one.new:g}" for one in sample.changes)
-    return f"{_time_of_day(sample.t_ns)}  version {sample.version} by {sample.who}:{taken_back} {changes}"
+    time_of_day = _time_of_day(sample.t_ns if is_clock_shared else time.monotonic_ns())
+    return f"{time_of_day}  version {sample.version} by {sample.who}:{taken_back} {changes}"
 
 
 def _table(title: str, *columns: str) -> Table:

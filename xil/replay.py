@@ -26,6 +26,7 @@ from xil.virtual_bus import GATEWAY_NODE
 UNNAMED_CHANNEL = "0"
 """Channel of a frame whose record names none."""
 
+_LARGEST_STANDARD_ID = (1 << 11) - 1
 _LARGEST_ID = (1 << 29) - 1
 _NS_PER_S = 1_000_000_000
 _MERGE_WINDOW_NS = _NS_PER_S
@@ -127,13 +128,17 @@ class Selection:
     senders: Collection[str] | None = None
     with_gateway: bool = False
 
+    def is_asked_for(self, message: can.Message) -> bool:
+        """Whether it is one of `ids`; an extended frame by a number that needs to be one."""
+        return message.arbitration_id in (self.ids or ()) and message.is_extended_id == (message.arbitration_id > _LARGEST_STANDARD_ID)
+
     def refusal(self, message: can.Message) -> str:
         """Why a frame is left out; empty when it is played."""
         spec = None if message.is_extended_id else self.catalogue.by_id.get(message.arbitration_id)
         sender = "" if spec is None else spec.sender
         if sender == GATEWAY_NODE and not self.with_gateway:
             return "of the gateway"
-        if self.ids is not None and message.arbitration_id not in self.ids:
+        if self.ids is not None and not self.is_asked_for(message):
             return "other id"
         if self.senders is not None and sender not in self.senders:
             return "other sender"
@@ -260,7 +265,8 @@ class Player:
         start_ns = self._clock()
         awaited = set(self._selection.ids or ())
         for frame in frames:
-            awaited.discard(frame.message.arbitration_id)
+            if self._selection.is_asked_for(frame.message):
+                awaited.discard(frame.message.arbitration_id)
             reason = "other channel" if frame.channel not in self._send else self._selection.refusal(frame.message)
             if reason:
                 self.played.left_out[reason] += 1

@@ -77,6 +77,7 @@ __all__ = [
     "WorldObject",
     "WorldSample",
     "ask",
+    "check_files",
     "decode",
     "new_boot_id",
     "port_of",
@@ -298,8 +299,10 @@ def ask(
                 if reply.ok is not None:
                     return reply.ok.payload.to_bytes()
                 refusal = reply.err.payload.to_string() if reply.err is not None else ""
-                raise TelemetryError(f"{source} on telemetry port {port}, {service}: {refusal}")
+                raise TelemetryError(f"{source} on {tls.endpoint(source) if tls else f'telemetry port {port}'}, {service}: {refusal}")
             time.sleep(_ASK_PERIOD_S)  # nobody took the request: the process has not declared its service yet
+    if tls is not None:
+        raise TelemetryError(f"{tls.endpoint(source)} serves no {service}, or the rig does not name {tls.certificate} among its writers")
     raise TelemetryError(f"port {port}, of --telemetry-port {base_port}, serves no {service}; name the ports of your run")
 
 

@@ -96,6 +96,18 @@ def test_a_node_of_another_name_is_one_change(tmp_path):
     # One that does not all that the other did is another node.
     found = differences(tmp_path, ("BU_: A B", "BU_: A B C"), ("BO_ 1 X: 8 A", "BO_ 1 X: 8 C"))
     assert found == [Change(True, "X", "", "sender", "A", "C")]
+    # One that only listens breaks nothing by its name; of two that listen alike nobody knows which is which.
+    listening = OLD.replace('"km/h" B', '"km/h" B,C').replace("BU_: A B", "BU_: A B C D")
+    assert differences(tmp_path, ('"km/h" B,C', '"km/h" B,E'), old=listening) == [Change(False, "", "", "node", "C", "E")]
+    both = listening.replace('"km/h" B,C', '"km/h" B,C,D')
+    assert differences(tmp_path, ('"km/h" B,C,D', '"km/h" B,E,F'), old=both) == [
+        Change(False, "X", "S", "receiver added", "", "E, F"),
+        Change(False, "X", "S", "receiver removed", "C, D", ""),
+    ]
+    assert differences(tmp_path, ('"km/h" B,C,D', '"km/h" B,E'), old=both) == [
+        Change(False, "X", "S", "receiver added", "", "E"),
+        Change(False, "X", "S", "receiver removed", "C, D", ""),
+    ]
 
 
 def test_no_change(tmp_path):

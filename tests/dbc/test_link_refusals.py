@@ -308,6 +308,11 @@ def test_a_refused_recovery_is_named_and_the_operator_may_try_again(clock, opene
             buses.receive()
         assert bus.restarts == 3
         assert "Operation not permitted" in buses.refusals["robots"]
+        bus.error_frame(0x100)  # restarted by somebody else
+        buses.receive()
+        assert (buses.health()["robots"].state, buses.refusals) == (BusState.ERROR_ACTIVE, {})
+        bus.error_frame(0x040)
+        buses.receive()
         buses.recover()
         for _ in range(1_000):
             clock.tick()

@@ -165,6 +165,7 @@ def test_a_rig_that_is_another_machine_is_tuned_by_its_writers_and_watched_by_it
     assert tuned.returncode == 0, tuned.stderr
     refused = xilgate("params", "set", f"{SAFE_TIME}=1.7", "--tls", files["reader"])
     assert (refused.returncode, len(refused.stderr.splitlines())) == (3, 1)
+    assert refused.stderr.endswith(f"serves no parameters, or the rig does not name {tmp_path}/reader.pem among its writers\n")
     assert "1.9" in xilgate("params", "get", SAFE_TIME, "--tls", files["tuner"]).stdout
 
     watching = start_xilgate("watch", "--tls", files["reader"])

@@ -142,6 +142,15 @@ def test_nothing_of_the_gateway_is_sent_unless_asked():
     assert play(select(CATALOGUE, None, ["GW"], with_gateway=False), every)[0] == []
 
 
+def test_an_extended_frame_is_asked_for_by_a_number_that_needs_to_be_one():
+    for number, is_extended, is_asked_for in ((0x210, False, True), (0x210, True, False), (0x18FF0001, True, True)):
+        time, chosen = FakeTime(), select(CATALOGUE, [hex(number)], None, with_gateway=False)
+        message = can.Message(arbitration_id=number, is_extended_id=is_extended)
+        player = time.player(chosen)
+        player.play([RecordedFrame(0, "robots", message)])
+        assert (len(time.sent), player.played.not_found) == ((1, []) if is_asked_for else (0, [number]))
+
+
 def test_ids_and_senders_choose():
     every = list(CATALOGUE.by_id)
     assert play(select(CATALOGUE, ["SR_Status", f"0x{by_name('AR_Status'):x}"], None, with_gateway=False), every)[0] == [
