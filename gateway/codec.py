@@ -178,7 +178,7 @@ class Codec:
             step, offset = self._catalogue.resolution(name, signal)
             if not step:  # in floating point our own are fine enough
                 continue
-            if abs(math.remainder(offset, step)) > _ROUNDING * step:
+            if not math.isclose(math.remainder(offset, step), 0.0, abs_tol=_ROUNDING * step):
                 raise EncodeError(f"{name}.{signal}: steps of {step:.6g} from {offset:.6g} do not meet 0")
             steps[demand] = step * unit
         return Resolution(**steps)

@@ -5,7 +5,6 @@ Everything is compared in SI units or in those of our DBC. What may differ is th
 
 import math
 import random
-import re
 import tomllib
 from itertools import pairwise
 from typing import NamedTuple
@@ -13,13 +12,13 @@ from typing import NamedTuple
 import cantools
 import pytest
 
-from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC, CatalogueError, DecodeError, EncodeError, load
+from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC, DecodeError, EncodeError, load
 from dbc.e2e import E2EReceiver, E2EStatus
 from dbc.frame import CanFrame
 from dbc.vehicle import load_vehicle
 from gateway.causes import Cause
-from gateway.core import TICK_NS, GatewayCore
-from gateway.limits import BENCH, NOMINAL, PROVING_GROUND
+from gateway.core import TICK_NS
+from gateway.limits import PROVING_GROUND
 from gateway.messages import Mode, Operation
 from tests.support import drive
 from tests.support.site import SITE_DBC, SITE_MAPPING, load_site
@@ -226,38 +225,6 @@ def test_rates_hold_on_the_steps_of_the_site(tmp_path, monkeypatch, speed_mps):
         )
     ]
     assert 0.9 < max(shares) <= 1.0 + 1e-9  # the one that limits is used, none is broken
-
-
-@pytest.mark.req("G1")
-def test_steps_with_which_a_profile_cannot_be_kept_are_refused(tmp_path):
-    for profile, step_deg, is_allowed in ((NOMINAL, 0.05, True), (NOMINAL, 0.1, False), (BENCH, 0.3, True), (BENCH, 0.5, False)):
-        catalogue = with_steering_step(tmp_path, step_deg)
-        if is_allowed:
-            GatewayCore(catalogue, load_vehicle(), 1, profile)
-            continue
-        said = rf"^coarse\.dbc, gnss_imu\.dbc: SR_Command\.AngleCommand: steps of {step_deg}, limits {profile.name} allow up to 0\.\d+$"
-        with pytest.raises(CatalogueError, match=said):
-            GatewayCore(catalogue, load_vehicle(), 1, profile)
-
-
-@pytest.mark.req("G4")
-@pytest.mark.parametrize(
-    ("identifier", "cycle_ms", "said"),
-    [
-        (272, 20, r"SR_Command: cycle time 20 ms, allowed: 10 ms$"),
-        (160, 0, r"GW_SafetyCommand: cycle time 0 ms, allowed: 10 ms$"),
-        (1792, 50, r"GW_Heartbeat: cycle time 50 ms, allowed: 100 ms$"),
-        (1793, 0, r"GW_Heartbeat: cycle time 100 ms, allowed: 10 ms; GW_Status: cycle time 0 ms, allowed: 10 ms$"),
-        (1793, 55, r"GW_Heartbeat: cycle time 100 ms, allowed: 50 ms; GW_Status: cycle time 55 ms, allowed: 50 ms$"),
-    ],
-)
-def test_cycles_at_which_the_gateway_does_not_send_are_refused(tmp_path, identifier, cycle_ms, said):
-    site = tmp_path / "site.dbc"
-    text, found = re.subn(rf'(BA_ "GenMsgCycleTime" BO_ {identifier}) \d+', rf"\1 {cycle_ms}", ROBOTS_DBC.read_text())
-    assert found == 1
-    site.write_text(text)
-    with pytest.raises(CatalogueError, match=r"^site\.dbc, gnss_imu\.dbc: " + said):
-        GatewayCore(load([site, GNSS_IMU_DBC]), load_vehicle(), 1)
 
 
 def test_what_the_robots_say_is_seen_to_within_the_resolution(monkeypatch):

@@ -115,7 +115,7 @@ def test_demands_have_the_steps_of_the_dbc(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("demand", STEPS)
-@pytest.mark.parametrize(("step", "offset"), [(0.07, -0.1), (0.5, -0.25), (0.5, 0.001), (0.5, -0.001)])
+@pytest.mark.parametrize(("step", "offset"), [(0.07, -0.1), (0.5, -0.25), (0.5, 0.001), (0.5, -1e-06)])
 def test_a_dbc_on_whose_steps_no_demand_is_neutral_is_refused(tmp_path, demand, step, offset):
     files, signal = dbc_with_step(tmp_path, demand, step, offset), STEPS[demand][2]
     with pytest.raises(CatalogueError, match=rf"^site\.dbc, gnss_imu\.dbc: .* {signal}: steps of {step} from {offset} do not meet 0$"):

@@ -2,6 +2,7 @@
 
 import copy
 import math
+import re
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
+from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC, CatalogueError, load
 from dbc.frame import CanFrame
 from dbc.health import LinkHealth
 from dbc.vehicle import load_vehicle
@@ -17,7 +19,7 @@ from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
 from gateway.conditions import Surroundings
 from gateway.core import ENGAGE_GRACE_NS, TICK_NS, GatewayCore
-from gateway.limits import LIFTED, PROVING_GROUND
+from gateway.limits import BENCH, LIFTED, NOMINAL, PROVING_GROUND
 from gateway.messages import CommandStatus, Mode, Operation, OperatorRequest
 from tests.support.drive import GatewayDrive
 
@@ -903,3 +905,43 @@ def test_in_a_gentle_stop_the_controller_goes_on_steering():
     drive.is_controller_alive = False
     drive.tick(20)
     assert drive.core.mode is Mode.SAFE_STOP
+
+
+# ---- a site's DBC
+
+
+def site_with(tmp_path, pattern, replacement):
+    site = tmp_path / "site.dbc"
+    text, found = re.subn(pattern, replacement, ROBOTS_DBC.read_text())
+    assert found == 1
+    site.write_text(text)
+    return load([site, GNSS_IMU_DBC])
+
+
+@pytest.mark.req("G1")
+def test_steps_with_which_a_profile_cannot_be_kept_are_refused(tmp_path):
+    for profile, step_deg, is_allowed in ((NOMINAL, 0.05, True), (NOMINAL, 0.1, False), (BENCH, 0.3, True), (BENCH, 0.5, False)):
+        catalogue = site_with(tmp_path, r'(AngleCommand : 16\|16@1- \()0\.05,0\) \[-1080', rf"\g<1>{step_deg},0) [-1080")
+        if is_allowed:
+            GatewayCore(catalogue, load_vehicle(), 1, profile)
+            continue
+        said = rf"^site\.dbc, gnss_imu\.dbc: SR_Command\.AngleCommand: steps of {step_deg}, limits {profile.name} allow up to 0\.\d+$"
+        with pytest.raises(CatalogueError, match=said):
+            GatewayCore(catalogue, load_vehicle(), 1, profile)
+
+
+@pytest.mark.req("G4")
+@pytest.mark.parametrize(
+    ("identifier", "cycle_ms", "said"),
+    [
+        (272, 20, r"SR_Command: cycle time 20 ms, allowed: 10 ms$"),
+        (160, 0, r"GW_SafetyCommand: cycle time 0 ms, allowed: 10 ms$"),
+        (1792, 50, r"GW_Heartbeat: cycle time 50 ms, allowed: 100 ms$"),
+        (1793, 0, r"GW_Heartbeat: cycle time 100 ms, allowed: 10 ms; GW_Status: cycle time 0 ms, allowed: 10 ms$"),
+        (1793, 55, r"GW_Heartbeat: cycle time 100 ms, allowed: 50 ms; GW_Status: cycle time 55 ms, allowed: 50 ms$"),
+    ],
+)
+def test_cycles_at_which_the_gateway_does_not_send_are_refused(tmp_path, identifier, cycle_ms, said):
+    catalogue = site_with(tmp_path, rf'(BA_ "GenMsgCycleTime" BO_ {identifier}) \d+', rf"\g<1> {cycle_ms}")
+    with pytest.raises(CatalogueError, match=r"^site\.dbc, gnss_imu\.dbc: " + said):
+        GatewayCore(catalogue, load_vehicle(), 1)
