@@ -46,6 +46,7 @@ class Cause(Enum):
     STEERING_IMPLAUSIBLE = Meaning(28, "steering angle moves impossibly fast", "rad/s")
     STEERING_NOT_FOLLOWING = Meaning(29, "steering robot does not follow", "rad")
     FRAMES_LOST = Meaning(30, "frames are lost", "%")
+    CAR_NOT_SLOWING = Meaning(31, "car does not slow down in a gentle stop", "m/s")
     COMMAND_FAILED = Meaning(40, "controller failed", "")
     COMMAND_LOST = Meaning(41, "controller silent", "ms")
     COMMAND_INVALID = Meaning(42, "commands are invalid", "")

@@ -9,6 +9,7 @@ from gateway.codec import Measurement
 from gateway.commands import NEVER_NS, CommandGate
 from gateway.limits import LimitProfile
 from gateway.messages import CommandStatus, Operation, OperatorRequest
+from gateway.safe_stop import plan_index
 
 COMMAND_TIMEOUT_NS = 100_000_000
 """Age at which a command is too old: one missed solve is tolerated, two are not."""
@@ -86,7 +87,9 @@ class Situation:
         is_driving: the gateway moves the car.
         is_settled: the robots have had time to follow into Engaged.
         steer_rad: road-wheel angle that is measured [rad].
+        lateral_mps2: what the limits make of it: kinematic lateral acceleration [m/s2].
         speed_mps: of the car, by navigation or wheels, whoever says more [m/s].
+        allowed_mps: the largest speed of a car that slows down as it is asked to [m/s]; infinite when it is not asked to gently.
         stopping_ns: time since the present stop began [ns]; 0 when there is none.
     """
 
@@ -103,7 +106,9 @@ class Situation:
     is_driving: bool
     is_settled: bool
     steer_rad: float
+    lateral_mps2: float
     speed_mps: float
+    allowed_mps: float
     stopping_ns: int
 
 
@@ -138,6 +143,8 @@ def findings(s: Situation, of_state: Sequence[Finding]) -> list[Finding]:
     found += _bus_findings(s)
     found += [finding for is_true, finding in _robot_findings(s) if is_true]
     found += [finding for is_true, finding in _command_findings(s) if is_true]
+    if s.tick_gap_ns > MAX_TICK_GAP_NS:
+        found.append(Finding(Cause.TICK_GAP, s.tick_gap_ns * _MS_PER_NS, MAX_TICK_GAP_NS * _MS_PER_NS, "gateway"))
     if s.is_driving:
         found += [finding for is_true, finding in _driving_findings(s) if is_true]
     return found
@@ -201,12 +208,11 @@ def _command_findings(s: Situation) -> Judged:
 
 def _driving_findings(s: Situation) -> Judged:
     m = s.measurement
-    gap_ms = s.tick_gap_ns * _MS_PER_NS
     deaf = ", ".join(m.deaf_robots)
     return (
-        (s.tick_gap_ns > MAX_TICK_GAP_NS, Finding(Cause.TICK_GAP, gap_ms, MAX_TICK_GAP_NS * _MS_PER_NS, "gateway")),
         (s.is_settled and bool(m.deaf_robots), Finding(Cause.ROBOT_MISSES_COMMANDS, len(m.deaf_robots), 0, deaf)),
         (s.is_settled and not m.is_engaged, Finding(Cause.ROBOTS_NOT_ENGAGED, 0, 1, "RC")),
+        (s.speed_mps > s.allowed_mps, Finding(Cause.CAR_NOT_SLOWING, s.speed_mps, s.allowed_mps, "car")),
     )
 
 
@@ -286,12 +292,21 @@ def _engage_refusals(s: Situation) -> list[str]:
     if command is None:
         return ["no command"]
     command_age_ns = s.commands.age_ns(s.now_ns)
-    steer_rad = abs(command.steer_rad - s.steer_rad)
+    steer_rad = abs(command.plan_steer_rad[plan_index(command, s.now_ns)] - s.steer_rad)
+    wheel_rad, lateral_mps2, p = abs(m.steering_wheel_rad), abs(s.lateral_mps2), s.profile
     conditions = (
         (not m.is_armed, "robots not armed"),
         (command_age_ns > MAX_ENGAGE_COMMAND_AGE_NS, f"newest command {command_age_ns * _MS_PER_NS:.0f} ms old, limit 60 ms"),
         (s.state_age_ns > MAX_ENGAGE_STATE_AGE_NS, f"state {s.state_age_ns * _MS_PER_NS:.0f} ms old, limit 50 ms"),
         (steer_rad > MAX_ENGAGE_STEER_RAD, f"steering {steer_rad:.3f} rad from the demand, limit {MAX_ENGAGE_STEER_RAD} rad"),
+        (
+            wheel_rad > p.steering_wheel_limit_rad,
+            f"steering wheel at {wheel_rad:.2f} rad, limit of {p.name} {p.steering_wheel_limit_rad} rad",
+        ),
+        (
+            lateral_mps2 > p.lateral_acceleration_mps2,
+            f"a bend of {lateral_mps2:.1f} m/s2, limit of {p.name} {p.lateral_acceleration_mps2} m/s2",
+        ),
         (
             abs(command.lateral_error_m) > MAX_ENGAGE_LATERAL_M,
             f"{command.lateral_error_m:.2f} m beside the path, limit {MAX_ENGAGE_LATERAL_M} m",

@@ -3,6 +3,7 @@
 Decode, judge, decide the mode, choose a demand, limit it, encode. Nothing here knows a clock, a socket or a bus.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -27,8 +28,8 @@ from gateway.conditions import (
     unsound_messages,
     untimely,
 )
-from gateway.latency import LatencyChain
-from gateway.limits import PROVING_GROUND, Demand, LimitProfile, coarsest
+from gateway.latency import LatencyChain, ValidityClock
+from gateway.limits import PROVING_GROUND, Demand, LimitProfile, coarsest, lateral_acceleration_mps2
 from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest, VehicleState
 from gateway.modes import DRIVING, QUIET, REACTIONS, TRANSITIONS, ModeMachine, Transition, Trigger
 from gateway.pacing import PULL_NS
@@ -101,6 +102,7 @@ class GatewayCore:
         self.profile = profile
         self._ratio = vehicle.steering.ratio
         self._wheel_radius_m = vehicle.model.wheel_radius_m
+        self._wheelbase_m = vehicle.model.cog_to_front_m + vehicle.model.cog_to_rear_m
         self._boot_id = boot_id
         self._codec = Codec(catalogue, RobotLimits(profile.steering_wheel_rate_radps, ROBOT_SPEED_MARGIN * profile.max_speed_mps))
         self._codec.check_resolution(coarsest(vehicle, profile, _SHORTEST_TICK_S), f"limits {profile.name} allow")
@@ -114,6 +116,7 @@ class GatewayCore:
         self._start_ns: int | None = None
         self._last_step_ns: int | None = None
         self._good_since_ns: int | None = None
+        self._validity = ValidityClock()
         self._state_time_ns = 0
         self._state_seq = 0
         self._is_state_good = False
@@ -172,7 +175,7 @@ class GatewayCore:
         self._last_step_ns = now_ns
         self.ticks += 1
         state, self._sensed = self._sensed or self._state(), None
-        reply = None if request is None else OperatorReply(request.boot_id, request.seq, request.operation, self.mode, tuple(refused))
+        reply = None if request is None else self._reply(request, refused, transition)
         return StepOutput(self._gate.admit(now_ns, self.mode, self._encode(now_ns, surroundings)), state, transition, reply)
 
     def sense(self, now_ns: int, frames: Sequence[CanFrame]) -> VehicleState | None:
@@ -194,14 +197,17 @@ class GatewayCore:
         before = (m.navigation_time_ms, m.watchdog_question, m.measurement_id)
         self._codec.update(m, self.supervisor.observe(frames))
         if m.navigation_time_ms != before[0] and (arrival_ns := self.supervisor.arrival_ns(_TIME_MESSAGE)) is not None:
-            # Only a new time of validity makes the state young: a frozen navigation system grows old.
-            self._state_time_ns = arrival_ns
+            # Only a newer time of validity makes the state young: a frozen navigation system grows old, and so does one that lags.
+            valid_ns = self._validity.arrived(arrival_ns, m.navigation_time_ms)
+            self._state_time_ns = self._state_time_ns if valid_ns is None else valid_ns
         if m.watchdog_question != before[1]:
             self._asked_ns = now_ns
         if m.measurement_id != before[2]:
             self.latency.echoed(m.measurement_id, now_ns)
 
     def _admit(self, now_ns: int, command: ControlCommand | None) -> None:
+        if self.mode in QUIET:
+            self._validity.restart()  # a lag is judged from READY on: until then other data may come, or a system that has begun anew
         if self.mode in QUIET and self.commands.age_ns(now_ns) > COMMAND_TIMEOUT_NS:
             self.commands.release()  # a controller that has gone may come back as another process
         if command is not None and self.commands.offer(now_ns, command, self._state_seq):
@@ -230,7 +236,9 @@ class GatewayCore:
             is_driving=is_driving,
             is_settled=is_settled,
             steer_rad=m.steering_wheel_rad / self._ratio,
+            lateral_mps2=lateral_acceleration_mps2(m.steering_wheel_rad / self._ratio, self._wheelbase_m, self._limiting_speed_mps),
             speed_mps=self._speed_mps,
+            allowed_mps=self._safe_stop.allowed_mps(now_ns) if self.mode is Mode.COMFORT_STOP and self._safe_stop is not None else math.inf,
             stopping_ns=0 if self._stop_since_ns is None else now_ns - self._stop_since_ns,
         )
 
@@ -239,6 +247,11 @@ class GatewayCore:
         """By whoever says more: a car stands when navigation and wheels agree that it does."""
         wheels_mps = median(self.measurement.wheel_speed_radps) * self._wheel_radius_m
         return max(abs(self.measurement.vx_mps), abs(wheels_mps))
+
+    @property
+    def _limiting_speed_mps(self) -> float:
+        """For the lateral limits. On a lift the wheels say nothing of the car that is steered."""
+        return self._speed_mps if self.profile.are_wheels_on_the_road else abs(self.measurement.vx_mps)
 
     def _blockers(self, situation: Situation) -> list[str]:
         blocked = blockers(situation, self.findings)
@@ -257,6 +270,12 @@ class GatewayCore:
             return [f"not possible in {self.mode.name}"]
         return refusals(request.operation, situation, self.blockers)
 
+    def _reply(self, request: OperatorRequest, refused: Sequence[str], transition: Transition | None) -> OperatorReply:
+        asked = _TRIGGER_OF_OPERATION.get(request.operation)
+        if not refused and asked is not None and transition is not None and transition.trigger is not asked:
+            refused = [transition.reason]  # something graver happened in the same step
+        return OperatorReply(request.boot_id, request.seq, request.operation, self.mode, tuple(refused))
+
     def _with_request(self, request: OperatorRequest | None, granted: Operation | None) -> list[Finding]:
         """The findings, and what the operator wants ended, or the gateway's own process before it ends."""
         if request is None or granted not in _CAUSE_OF_OPERATION:
@@ -271,7 +290,7 @@ class GatewayCore:
 
     def _enter(self, now_ns: int, transition: Transition) -> None:
         m = self.measurement
-        if transition.before in DRIVING and transition.finding is not None:
+        if transition.finding is not None and (transition.before is Mode.ENGAGED or transition.after in _STOPPED):
             self.disengagement = Disengagement(now_ns, transition.finding)
         if transition.after is Mode.ENGAGED:
             self._engaged_since_ns = now_ns
@@ -279,7 +298,14 @@ class GatewayCore:
             self.actuation.start_from(Demand(m.steering_wheel_rad, m.accelerator_norm, m.brake_norm))
         elif transition.after in (Mode.COMFORT_STOP, Mode.SAFE_STOP):
             grade = self.profile.safe_stop if transition.after is Mode.SAFE_STOP else self.profile.comfort_stop
-            self._safe_stop = SafeStop(now_ns, self.commands.newest, self.actuation.steer_rad, -self.actuation.acceleration_mps2, grade)
+            self._safe_stop = SafeStop(
+                now_ns,
+                self.commands.newest,
+                grade,
+                steer_rad=self.actuation.steer_rad,
+                speed_mps=self._speed_mps,
+                deceleration_mps2=-self.actuation.acceleration_mps2,
+            )
         elif transition.after is Mode.STANDBY and transition.before is not Mode.READY:
             self.commands.reset()
         self._stop_since_ns = now_ns if transition.after in _STOPPED else None
@@ -291,7 +317,7 @@ class GatewayCore:
             self.actuation.pass_time(now_ns - self._last_step_ns)
         if self.mode is Mode.ENGAGED and command is not None:
             k = plan_index(command, now_ns)
-            self.actuation.follow(command.plan_steer_rad[k], command.plan_drive_norm[k], m.vx_mps, m.brake_norm)
+            self.actuation.follow(command.plan_steer_rad[k], command.plan_drive_norm[k], self._limiting_speed_mps, m.brake_norm)
         elif self.mode in (Mode.COMFORT_STOP, Mode.SAFE_STOP) and self._safe_stop is not None:
             stop = self._safe_stop.demand(now_ns, self._speed_mps)
             steer_rad = stop.steer_rad
@@ -300,7 +326,7 @@ class GatewayCore:
             if stop.is_standing:
                 self.actuation.hold_still()
             else:
-                self.actuation.decelerate(steer_rad, stop.deceleration_mps2, m.vx_mps, m.brake_norm)
+                self.actuation.decelerate(steer_rad, stop.deceleration_mps2, self._limiting_speed_mps, m.brake_norm)
         else:
             self.actuation.release()
 

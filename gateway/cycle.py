@@ -14,8 +14,8 @@ from gateway.ending import Ending
 from gateway.housekeeping import Notice, Orders, Pulse
 from gateway.journal import Glance, StepArguments
 from gateway.loop import ArrivalWait, CpuLoad
-from gateway.messages import ControlCommand, Operation, OperatorReply, OperatorRequest
-from gateway.modes import DRIVING, QUIET
+from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest
+from gateway.modes import QUIET
 from gateway.pacing import Pacer
 from gateway.preparation import Preparation
 from gateway.recorder import Recorder, RecorderStatus
@@ -120,9 +120,9 @@ class ControlCycle:
         return Surroundings(buses.health(), is_recording, self._record.disk_free_share, load_norm, self._cpu_load.update(now_ns, cpu_ns))
 
     def _answer(self, reply: OperatorReply) -> None:
-        # A bus-off that is still there must not keep a reset from being granted. While the car is driven there is none to leave, and a
+        # A bus-off that is still there must not keep a reset from being granted. While robots listen there is none to leave, and a
         # request that is refused anyway must not make the link forget which of its frames have not got through.
-        if reply.operation is Operation.RESET and reply.mode not in DRIVING:
+        if reply.operation is Operation.RESET and reply.mode in (*QUIET, Mode.FAULT):
             self._links.buses.recover()
         if reply.boot_id != self._boot_id:
             self._links.operators.reply(reply)

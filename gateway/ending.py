@@ -2,7 +2,6 @@
 
 from gateway.conditions import STANDING_MPS
 from gateway.messages import Mode, Operation
-from gateway.modes import DRIVING
 
 STANDSTILL_NS = 1_000_000_000
 """How long the car must have stood, so that it does not roll on from a nod."""
@@ -14,7 +13,7 @@ class Ending:
     """Decides, tick by tick from the first one on, what to ask of the core and when it is over.
 
     A car that is driven is stopped gently first, and left with the brake on: the robots then hold it by themselves, because the
-    gateway falls silent. Robots that are armed are disarmed first. Else there is nothing to wait for.
+    gateway falls silent. Robots that may be armed hear that they are not. Where nothing is sent, there is nothing to wait for.
 
     Args:
         within_ns: longest time that it may take [ns].
@@ -24,7 +23,6 @@ class Ending:
         self._deadline_ns = now_ns + within_ns
         self._standing_since_ns: int | None = None
         self._disarmed_ns: int | None = None
-        self._was_armed = False
 
     def request(self, mode: Mode) -> Operation | None:
         """What to ask of the core in this tick."""
@@ -38,13 +36,13 @@ class Ending:
         """
         if now_ns >= self._deadline_ns:
             return True
-        if mode is Mode.READY:
-            self._was_armed = True
-            return False
-        if mode not in DRIVING:
+        if mode in (Mode.SILENT, Mode.FAULT):
+            return True
+        if mode is Mode.STANDBY:
             self._disarmed_ns = self._disarmed_ns or now_ns
-            return not self._was_armed or now_ns - self._disarmed_ns >= DISARM_NS
-        self._was_armed = True
+            return now_ns - self._disarmed_ns >= DISARM_NS
+        if mode is Mode.READY:
+            return False
         if not (is_speed_valid and abs(speed_mps) < STANDING_MPS):
             self._standing_since_ns = None
             return False

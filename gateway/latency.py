@@ -1,7 +1,11 @@
-"""Age at actuation: how old the measurement is that the robots act on, from the navigation data to the robots' status and back.
+"""How old the navigation data are when they arrive, and when the robots act on them.
 
-Every admitted command gets the next of 16 ids and is remembered with the time of the state that it answers. The robots echo the id
-when they act on it; the time until then is measured here, in the gateway's own clock.
+Age on arrival: the data tell their time of validity in a clock of their own. It is ahead of ours by what it is ahead when they come
+soonest; data that come later are older. So a delay that grows or begins shows, one that has always been there does not.
+
+Age at actuation, from the navigation data to the robots' status and back: every admitted command gets the next of 16 ids and is
+remembered with the time of the state that it answers. The robots echo the id when they act on it; the time until then is measured here,
+in the gateway's own clock.
 """
 
 from gateway.causes import Cause, Finding
@@ -15,7 +19,34 @@ MAX_LATE_IN_A_ROW = 2
 BUCKETS_NS = tuple(ms * 1_000_000 for ms in (10, 20, 30, 40, 50, 60, 80, 100, 120, 150, 200, 300))
 """Upper ends of the histogram's buckets, each inclusive; one more bucket takes what is above."""
 
+MAX_DRIFT = 500e-6
+"""Rate at which the two clocks may drift apart: the fastest that the kernel lets a clock be corrected; crystals are ten times better."""
+
 _MS_PER_NS = 1e-6
+_NS_PER_MS = 1_000_000
+
+
+class ValidityClock:
+    """Puts times of validity on our clock."""
+
+    def __init__(self) -> None:
+        self._newest_ms: int | None = None
+        self._arrival_ns = 0
+        self._offset_ns = 0
+
+    def restart(self) -> None:
+        """Learn anew how far the clocks are apart."""
+        self._newest_ms = None
+
+    def arrived(self, arrival_ns: int, validity_ms: int) -> int | None:
+        """When data that arrive now were valid [ns], at the latest now; None when they are not newer than those before."""
+        offset_ns = arrival_ns - validity_ms * _NS_PER_MS
+        if self._newest_ms is not None:
+            if validity_ms <= self._newest_ms:
+                return None
+            offset_ns = min(offset_ns, self._offset_ns + round((arrival_ns - self._arrival_ns) * MAX_DRIFT))
+        self._newest_ms, self._arrival_ns, self._offset_ns = validity_ms, arrival_ns, offset_ns
+        return validity_ms * _NS_PER_MS + offset_ns
 
 
 class LatencyChain:

@@ -24,7 +24,6 @@ class Pacer:
         start_ns: monotonic time [ns]; the first step is due one period later.
 
     Attributes:
-        deadline_ns: when the next step is due without a command [ns].
         overruns: periods that were skipped because the caller or the machine was late by a whole period or more.
     """
 
@@ -33,13 +32,19 @@ class Pacer:
         self._last_command_ns: int | None = None
         self._credit_ns = CREDIT_NS
         self._is_pulled = False
-        self.deadline_ns = start_ns + period_ns
+        self._grid_ns = start_ns + period_ns
+        self._earliest_ns = start_ns
         self.overruns = 0
+
+    @property
+    def deadline_ns(self) -> int:
+        """When the next step is due without a command [ns]; after a late one not at once, or two demands would come as one."""
+        return max(self._grid_ns, self._earliest_ns)
 
     def command_arrived(self, now_ns: int) -> None:
         """Tell of a command. One that is too early waits for the deadline: to be answered a little sooner would use up the credit."""
         self._last_command_ns = now_ns
-        self._is_pulled = now_ns >= self.deadline_ns - min(self._credit_ns, PULL_NS)
+        self._is_pulled = now_ns >= max(self._grid_ns - min(self._credit_ns, PULL_NS), self._earliest_ns)
 
     def is_due(self, now_ns: int) -> bool:
         """Whether to step now."""
@@ -47,11 +52,12 @@ class Pacer:
 
     def stepped(self, now_ns: int) -> None:
         """Set the next deadline after a step that was due at `now_ns`."""
-        pulled_to_ns = min(now_ns, self.deadline_ns)
+        pulled_to_ns = min(now_ns, self._grid_ns)
         skipped = (now_ns - pulled_to_ns) // self._period_ns
         self.overruns += skipped
         is_flowing = self._last_command_ns is not None and now_ns - self._last_command_ns < FLOW_NS
         drift_ns = DRIFT_NS if is_flowing else 0
-        self._credit_ns = min(self._credit_ns - (self.deadline_ns - pulled_to_ns) + drift_ns, CREDIT_NS)
+        self._credit_ns = min(self._credit_ns - (self._grid_ns - pulled_to_ns) + drift_ns, CREDIT_NS)
         self._is_pulled = False
-        self.deadline_ns = pulled_to_ns + (skipped + 1) * self._period_ns + drift_ns
+        self._grid_ns = pulled_to_ns + (skipped + 1) * self._period_ns + drift_ns
+        self._earliest_ns = now_ns + self._period_ns - PULL_NS

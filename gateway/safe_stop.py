@@ -10,6 +10,10 @@ from gateway.limits import StopGrade
 from gateway.messages import HORIZON_STEPS, PLAN_PERIOD_NS, ControlCommand
 
 STANDSTILL_MPS = 0.1
+SLOWING_SHARE = 0.5
+"""Part of what a stop asks for that must have become of the speed: a slope takes 1 m/s2 at 10 %, as much as a gentle stop gives."""
+SLOWING_MARGIN_MPS = 2.0
+"""What may be missing besides: an engine that still pulls with 3 m/s2 for 0.3 s, and brakes that begin as late."""
 
 
 def plan_index(command: ControlCommand, now_ns: int) -> int:
@@ -37,21 +41,38 @@ class SafeStop:
 
     Args:
         last_command: the newest valid command, or None when there never was one.
+        grade: how firmly.
         steer_rad: road-wheel angle to hold without a plan [rad].
+        speed_mps: at the start.
         deceleration_mps2: deceleration at the start: a car that brakes already goes on from there, and a comfort stop that becomes an
             emergency stop from what it has reached.
-        grade: how firmly.
     """
 
     def __init__(
-        self, start_ns: int, last_command: ControlCommand | None, steer_rad: float, deceleration_mps2: float, grade: StopGrade
+        self,
+        start_ns: int,
+        last_command: ControlCommand | None,
+        grade: StopGrade,
+        *,
+        steer_rad: float,
+        speed_mps: float,
+        deceleration_mps2: float,
     ) -> None:
         self._start_ns = start_ns
+        self._speed_mps = speed_mps
         self._last_command = last_command
         self._steer_rad = steer_rad
         self._initial_deceleration_mps2 = max(0.0, deceleration_mps2)
         self._grade = grade
         self._is_standing = False
+
+    def allowed_mps(self, now_ns: int) -> float:
+        """The largest speed at `now_ns` of a car that slows down [m/s]: a steep slope may be stronger than the brake of a gentle stop."""
+        elapsed_s, initial_mps2 = (now_ns - self._start_ns) * 1e-9, self._initial_deceleration_mps2
+        more_mps2 = max(self._grade.deceleration_mps2 - initial_mps2, 0.0)
+        growing_s = min(elapsed_s, more_mps2 / self._grade.jerk_mps3)
+        asked_mps = initial_mps2 * elapsed_s + 0.5 * self._grade.jerk_mps3 * growing_s**2 + more_mps2 * (elapsed_s - growing_s)
+        return max(self._speed_mps + SLOWING_MARGIN_MPS - SLOWING_SHARE * asked_mps, STANDSTILL_MPS)
 
     def demand(self, now_ns: int, vx_mps: float) -> StopDemand:
         """Demand at `now_ns` for a car at speed `vx_mps`; standing is latched."""

@@ -17,8 +17,8 @@ def ticks_until_over(ending, mode, speed_mps=0.0, is_valid=True, from_ns=0):
     return None
 
 
-@pytest.mark.parametrize("mode", [Mode.SILENT, Mode.STANDBY, Mode.FAULT])
-def test_where_nothing_moves_it_is_over_at_once(mode):
+@pytest.mark.parametrize("mode", [Mode.SILENT, Mode.FAULT])
+def test_where_nothing_is_sent_it_is_over_at_once(mode):
     ending = Ending(0, WITHIN_NS)
     assert ending.request(mode) is None
     assert ticks_until_over(ending, mode) == 0
@@ -53,6 +53,10 @@ def test_robots_that_are_armed_are_disarmed_first():
     assert ending.request(Mode.READY) is Operation.DISENGAGE
     assert not ending.is_over(10 * MS, Mode.READY, 0.0, True)
     assert ticks_until_over(ending, Mode.STANDBY, from_ns=20 * MS) == DISARM_NS // MS
+
+
+def test_robots_that_have_just_been_disarmed_may_not_have_heard_it():
+    assert ticks_until_over(Ending(0, WITHIN_NS), Mode.STANDBY, from_ns=10 * MS) == DISARM_NS // MS
 
 
 def test_a_driver_who_takes_over_ends_it_soon():

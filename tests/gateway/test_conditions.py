@@ -1,5 +1,6 @@
 """What follows from a situation: findings, blockers, refusals. Every condition just within its limit, and just beyond it."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -10,7 +11,7 @@ from gateway.causes import Cause, Finding
 from gateway.codec import Measurement
 from gateway.commands import CommandGate
 from gateway.conditions import Situation, Surroundings, blockers, findings, refusals, settling, state_findings, untimely
-from gateway.limits import PROVING_GROUND
+from gateway.limits import BENCH, NOMINAL, PROVING_GROUND
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, Operation, OperatorRequest
 
 MS = 1_000_000
@@ -42,7 +43,7 @@ def situation(**changes):
     well = Situation(
         now_ns=NOW_NS, measurement=measured(), commands=gate(), surroundings=Surroundings({"robots": LinkHealth()}), profile=PROVING_GROUND,
         observed=[], state_age_ns=0, navigation_timeout_ns=TIMEOUT_NS, question_age_ns=0, tick_gap_ns=10 * MS, is_driving=True,
-        is_settled=True, steer_rad=0.0, speed_mps=0.0, stopping_ns=0,
+        is_settled=True, steer_rad=0.0, lateral_mps2=0.0, speed_mps=0.0, allowed_mps=math.inf, stopping_ns=0,
     )  # fmt: skip
     return replace(well, **changes)
 
@@ -125,6 +126,11 @@ BEYOND = [
         {"measurement": measured(is_engaged=False)},
         Finding(Cause.ROBOTS_NOT_ENGAGED, 0, 1, "RC"),
     ),
+    (
+        {"speed_mps": 15.0, "allowed_mps": 15.0},
+        {"speed_mps": 15.1, "allowed_mps": 15.0},
+        Finding(Cause.CAR_NOT_SLOWING, 15.1, 15.0, "car"),
+    ),
 ]
 
 
@@ -137,7 +143,7 @@ def test_each_finding_begins_beyond_its_limit(within, beyond, expected):
 
 
 def test_what_only_matters_while_driving():
-    trouble = {"tick_gap_ns": 51 * MS, "measurement": measured(is_engaged=False, deaf_robots=("SR",))}
+    trouble = {"speed_mps": 2.0, "allowed_mps": 1.0, "measurement": measured(is_engaged=False, deaf_robots=("SR",))}
     assert len(found(situation(**trouble))) == 3
     assert found(situation(**trouble, is_driving=False)) == []
 
@@ -227,9 +233,30 @@ ENGAGING = [
     ({"steer_rad": 0.0349}, {"steer_rad": 0.036}, "steering 0.036 rad from the demand, limit 0.0349 rad"),
     ({"steer_rad": -0.0349}, {"steer_rad": -0.036}, "steering 0.036 rad from the demand, limit 0.0349 rad"),
     (
-        {"steer_rad": 0.1, **demanding(steer_rad=0.12)},
-        {"steer_rad": 0.1, **demanding(steer_rad=0.14)},
+        {"steer_rad": 0.1, **demanding(plan_steer_rad=(0.12,) * HORIZON_STEPS)},
+        {"steer_rad": 0.1, **demanding(plan_steer_rad=(0.14,) * HORIZON_STEPS)},
         "steering 0.040 rad from the demand, limit 0.0349 rad",
+    ),
+    (  # what is followed is the entry of the plan that holds now
+        {"steer_rad": 0.1, **demanding(plan_steer_rad=(0.0, 0.1) + (0.0,) * 28), **with_command_age(40 * MS)},
+        {"steer_rad": 0.05, **demanding(plan_steer_rad=(0.0, 0.1) + (0.0,) * 28), **with_command_age(40 * MS)},
+        "steering 0.050 rad from the demand, limit 0.0349 rad",
+    ),
+    *(
+        (
+            {"measurement": measured(steering_wheel_rad=sign * 1.57), "profile": BENCH},
+            {"measurement": measured(steering_wheel_rad=sign * 1.58), "profile": BENCH},
+            "steering wheel at 1.58 rad, limit of bench 1.57 rad",
+        )
+        for sign in (1, -1)
+    ),
+    *(
+        (
+            {"lateral_mps2": sign * 3.0, "profile": NOMINAL},
+            {"lateral_mps2": sign * 3.1, "profile": NOMINAL},
+            "a bend of 3.1 m/s2, limit of nominal 3.0 m/s2",
+        )
+        for sign in (1, -1)
     ),
     (demanding(lateral_error_m=1.5), demanding(lateral_error_m=1.51), "1.51 m beside the path, limit 1.5 m"),
     (demanding(lateral_error_m=-1.5), demanding(lateral_error_m=-1.51), "-1.51 m beside the path, limit 1.5 m"),

@@ -17,6 +17,7 @@ from dbc.health import LinkHealth
 from dbc.vehicle import load_vehicle
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
+from gateway.codec import MONITOR_MESSAGES
 from gateway.conditions import Surroundings
 from gateway.core import ENGAGE_GRACE_NS, TICK_NS, GatewayCore
 from gateway.limits import BENCH, LIFTED, NOMINAL, PROVING_GROUND
@@ -221,7 +222,7 @@ def test_safe_stop_follows_the_tail_of_the_plan():
         (lambda d: setattr(d.car, "position_mode", "Blanked"), Cause.NAVIGATION_COARSE, Mode.SAFE_STOP),
         (lambda d: setattr(d.car, "fault", 1), Cause.ROBOT_FAULT, Mode.SAFE_STOP),
         (lambda d: setattr(d.car, "command_timeout", 1), Cause.ROBOT_MISSES_COMMANDS, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "system_state", "Armed"), Cause.ROBOTS_NOT_ENGAGED, Mode.SAFE_STOP),
+        (lambda d: setattr(d.car, "system_state", "Armed"), Cause.ROBOTS_NOT_ENGAGED, Mode.FAULT),
         (lambda d: setattr(d.car, "system_state", "EStop"), Cause.ROBOTS_EMERGENCY_STOP, Mode.FAULT),
         (lambda d: setattr(d, "status", CommandStatus.FAILED), Cause.COMMAND_FAILED, Mode.SAFE_STOP),
         (lambda d: setattr(d, "command_boot_id", 8), Cause.COMMAND_LOST, Mode.SAFE_STOP),
@@ -641,10 +642,138 @@ def test_the_robots_have_200_ms_to_follow():
     assert drive.transitions[-1].finding.cause is Cause.ROBOTS_NOT_ENGAGED
 
 
+@pytest.mark.req("E4")
+def test_robots_that_have_not_followed_are_not_asked_any_more():
+    """Or they would take a wheel that somebody else has, whenever it pleases them."""
+    drive = GatewayDrive()
+    drive.car.system_state = "Armed"
+    drive.engage().tick(25)
+    assert drive.core.mode is Mode.FAULT
+    for _ in range(100):
+        names = {drive.catalogue.by_id[frame.arbitration_id].name for frame in drive.tick().output.frames}
+        assert names <= set(MONITOR_MESSAGES)
+
+
+@pytest.mark.req("E3")
+def test_robots_that_have_let_go_for_a_driver_are_no_fault():
+    drive = engaged().tick(50)
+    drive.car.system_state, drive.car.override = "Disarmed", 1
+    drive.tick(2)
+    assert (drive.core.mode, drive.transitions[-1].finding.cause) == (Mode.STANDBY, Cause.DRIVER_OVERRIDE)
+
+
+@pytest.mark.req("F1")
+def test_a_car_that_a_gentle_stop_does_not_slow_is_stopped_firmly():
+    drive = engaged().tick(50)
+    drive.car.vx_mps = 10.0  # and stays: it rolls down a hill
+    drive.tick(20)
+    drive.ask(Operation.STOP)
+    drive.tick(560)
+    assert drive.core.mode is Mode.COMFORT_STOP
+    drive.tick(20)
+    assert drive.core.mode is Mode.SAFE_STOP
+    assert drive.core.disengagement.finding.cause is Cause.CAR_NOT_SLOWING
+    drive.tick(300)
+    assert drive.car.told["BR_Command"]["PositionCommand"] == pytest.approx(25.0, abs=0.01)
+    assert drive.core.findings == []  # a firm stop has nothing above it
+
+
+@pytest.mark.req("F1")
+def test_a_car_that_follows_a_gentle_stop_stays_in_it():
+    drive = GatewayDrive()
+    drive.car.is_following, drive.car.vx_mps = True, 20.0
+    drive.drive_norm = 1.0  # the engine pulls until the stop begins
+    drive.engage().tick(200)
+    drive.ask(Operation.STOP)
+    drive.tick(3_000)
+    assert (drive.core.mode, drive.core.disengagement.finding.cause) == (Mode.COMFORT_STOP, Cause.OPERATOR_STOP)
+    assert drive.car.vx_mps == 0.0
+
+
+@pytest.mark.req("F13")
+def test_a_gateway_that_slept_before_an_engagement_looks_again_first():
+    drive = armed()
+    drive.now_ns += 50_000_000
+    drive.ask(Operation.ENGAGE)
+    drive.tick()
+    assert drive.core.mode is Mode.STANDBY
+    assert drive.output.reply.refusals[0].startswith("gateway was stopped: gateway, 60 ms")
+
+
+@pytest.mark.req("F9")
+@pytest.mark.parametrize(("step_ms", "is_found"), [(0, False), (45, False), (60, True)])
+def test_navigation_data_that_come_later_than_they_did_are_older(step_ms, is_found):
+    drive = engaged().tick(50)
+    age_ns = drive.now_ns - drive.output.state.t_ns
+    drive.car._time_ms -= step_ms
+    drive.tick()  # repeats what was valid already, or goes back
+    drive.tick(6)
+    assert drive.now_ns - drive.output.state.t_ns - age_ns == pytest.approx(1_000_000 * step_ms, abs=40_000)
+    assert (drive.core.mode is not Mode.ENGAGED) is is_found
+    if is_found:
+        assert drive.transitions[-1].finding.cause is Cause.NAVIGATION_FROZEN
+
+
+@pytest.mark.req("F8")
+def test_a_time_of_validity_that_goes_to_and_fro_is_not_new():
+    drive = engaged().tick(50)
+    for k in range(12):
+        drive.car._time_ms -= 10 + (5 if k % 2 else -5)
+        drive.tick()
+    assert drive.transitions[-1].finding.cause is Cause.NAVIGATION_FROZEN
+
+
+@pytest.mark.req("F8")
+def test_before_an_operator_arms_a_navigation_system_may_begin_anew():
+    drive = GatewayDrive().tick(300)
+    drive.car._time_ms = 5
+    drive.tick(250)
+    assert drive.core.blockers == []
+    assert drive.output.state.t_ns == drive.now_ns
+
+
+@pytest.mark.req("G1")
+@pytest.mark.parametrize(("profile", "limit_mps2"), [(PROVING_GROUND, 15.0), (LIFTED, math.inf)])
+def test_the_faster_of_two_speeds_limits_the_steering(profile, limit_mps2):
+    drive = GatewayDrive()
+    drive.core = GatewayCore(drive.catalogue, load_vehicle(), boot_id=1, profile=profile)
+    drive.engage().tick(50)
+    drive.car.vx_mps, drive.car.wheel_speed_offset_mps = 0.0, 20.0
+    drive.plan_steer_rad = (0.4,) * 30
+    largest_mps2 = 0.0
+    for _ in range(100):
+        drive.tick()
+        road_wheel_rad = math.radians(drive.car.told["SR_Command"]["AngleCommand"]) / 14.7
+        largest_mps2 = max(largest_mps2, 20.0**2 * math.tan(road_wheel_rad) / 2.648)
+    assert largest_mps2 == pytest.approx(min(limit_mps2, 63.9), abs=0.2)
+
+
+def test_a_reset_that_something_graver_prevents_says_so():
+    drive = engaged().tick(50)
+    drive.car.vx_mps = 0.0
+    drive.tick(20)
+    drive.ask(Operation.STOP)
+    drive.tick(10)
+    drive.car.emergency_stop = 1
+    drive.ask(Operation.RESET)
+    drive.tick()
+    assert drive.core.mode is Mode.FAULT
+    assert drive.output.reply.refusals == ("emergency stop of the robots: None",)
+
+
+def test_a_driver_who_takes_over_in_a_stop_does_not_become_its_cause():
+    drive = engaged().tick(50)
+    drive.status = CommandStatus.FAILED
+    drive.tick(10)
+    drive.car.override = 1
+    drive.tick(5)
+    assert (drive.core.mode, drive.core.disengagement.finding.cause) == (Mode.STANDBY, Cause.COMMAND_FAILED)
+
+
 def test_a_wheel_that_nobody_steers_follows_nothing():
     drive = GatewayDrive()
-    drive.car.steering_wheel_deg = 90.0
-    drive.steer_rad = math.radians(90.0) / 14.7
+    drive.car.steering_wheel_deg = 80.0
+    drive.steer_rad = math.radians(80.0) / 14.7
     drive.arm().tick(100)
     assert (drive.core.mode, drive.core.findings) == (Mode.READY, [])
     drive.engage().tick(5)

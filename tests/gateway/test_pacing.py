@@ -67,7 +67,7 @@ def test_the_rate_is_never_above_the_nominal_one_whatever_comes():
 def test_a_stall_is_skipped_and_counted():
     pacer, steps, _ = run(1.0, [], stall=(95 * MS, 345 * MS))
     assert pacer.overruns == 24
-    assert [step for step in steps if step >= 90 * MS][:4] == [90 * MS, 345 * MS, 350 * MS, 360 * MS]
+    assert [step for step in steps if step >= 90 * MS][:4] == [90 * MS, 345 * MS, 351 * MS, 360 * MS]
 
 
 def test_a_step_is_due_at_its_deadline():
@@ -105,9 +105,8 @@ def test_the_credit_comes_back_with_the_periods_up_to_its_end():
 
 def test_the_periods_are_longer_while_commands_come():
     for since_ns, drift_ns in ((FLOW_NS - 1, DRIFT_NS), (FLOW_NS, 0)):
-        pacer = Pacer(0, PERIOD_NS)
+        pacer = Pacer(since_ns, PERIOD_NS)
         pacer.command_arrived(PERIOD_NS)
-        pacer.deadline_ns = PERIOD_NS + since_ns
         pacer.stepped(PERIOD_NS + since_ns)
         assert pacer.deadline_ns == PERIOD_NS + since_ns + PERIOD_NS + drift_ns
 
@@ -116,4 +115,25 @@ def test_a_whole_period_late_is_one_overrun_and_the_grid_stays():
     for late_ns, overruns in ((PERIOD_NS - 1, 0), (PERIOD_NS, 1), (3 * PERIOD_NS - 1, 2)):
         pacer = Pacer(0, PERIOD_NS)
         pacer.stepped(PERIOD_NS + late_ns)
-        assert (pacer.overruns, pacer.deadline_ns) == (overruns, (2 + overruns) * PERIOD_NS)
+        assert pacer.overruns == overruns
+        for _ in range(3):  # by the third step it has been made up for
+            pacer.stepped(pacer.deadline_ns)
+        assert pacer.deadline_ns == (5 + overruns) * PERIOD_NS
+
+
+def test_no_step_follows_another_at_once():
+    for late_ns, next_ns in ((PULL_NS, 2 * PERIOD_NS), (PULL_NS + 1, 2 * PERIOD_NS + 1), (PERIOD_NS - 1, 3 * PERIOD_NS - PULL_NS - 1)):
+        pacer = Pacer(0, PERIOD_NS)
+        pacer.stepped(PERIOD_NS + late_ns)
+        assert pacer.deadline_ns == next_ns
+        earliest_ns = PERIOD_NS + late_ns + PERIOD_NS - PULL_NS
+        pacer.command_arrived(earliest_ns - 1)
+        assert not pacer.is_due(next_ns - 1)
+        pacer.command_arrived(earliest_ns)
+        assert pacer.is_due(earliest_ns)
+
+
+def test_the_first_command_may_pull_the_first_step():
+    pacer = Pacer(5, PERIOD_NS)
+    pacer.command_arrived(5 + PERIOD_NS - PULL_NS)
+    assert pacer.is_due(5 + PERIOD_NS - PULL_NS)

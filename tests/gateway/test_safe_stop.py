@@ -22,8 +22,10 @@ def command(t_ns=START_NS, plan=None):
     )  # fmt: skip
 
 
-def stop(grade=EMERGENCY_STOP, *, last_command=None, steer_rad=0.02, deceleration_mps2=0.0):
-    return SafeStop(START_NS, last_command, steer_rad, deceleration_mps2, grade)
+def stop(grade=EMERGENCY_STOP, *, start_ns=START_NS, last_command=None, steer_rad=0.02, speed_mps=20.0, deceleration_mps2=0.0):
+    return SafeStop(
+        start_ns, last_command, grade, steer_rad=steer_rad, speed_mps=speed_mps, deceleration_mps2=deceleration_mps2
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -68,7 +70,7 @@ def test_a_comfort_stop_that_becomes_an_emergency_stop_goes_on_from_its_decelera
     comfort = stop(COMFORT_STOP)
     reached_mps2 = comfort.demand(START_NS + 2_000 * MS, 20.0).deceleration_mps2
     assert reached_mps2 == pytest.approx(0.6)
-    emergency = SafeStop(START_NS + 2_000 * MS, None, 0.0, reached_mps2, EMERGENCY_STOP)
+    emergency = stop(start_ns=START_NS + 2_000 * MS, deceleration_mps2=reached_mps2)
     assert emergency.demand(START_NS + 2_000 * MS, 20.0).deceleration_mps2 == pytest.approx(0.6)
     assert emergency.demand(START_NS + 2_010 * MS, 20.0).deceleration_mps2 == pytest.approx(0.615)
 
@@ -104,6 +106,20 @@ def test_a_car_that_has_stood_is_held_whatever_the_speed_says():
     assert not s.demand(START_NS, 0.2).is_standing
     assert s.demand(START_NS + 10 * MS, 0.0).is_standing
     assert s.demand(START_NS + 20 * MS, 3.0).is_standing
+
+
+@pytest.mark.parametrize("deceleration_mps2", [-1.0, 0.0, 0.4, 1.0, 3.0])
+@pytest.mark.parametrize("grade", [COMFORT_STOP, EMERGENCY_STOP], ids=str)
+def test_a_car_that_slows_down_has_lost_half_of_what_was_asked_for(grade, deceleration_mps2):
+    s, asked_mps = stop(grade, speed_mps=30.0, deceleration_mps2=deceleration_mps2), 0.0
+    for after_ms in range(1, 8_001):
+        asked_mps += s.demand(START_NS + after_ms * MS - MS // 2, 20.0).deceleration_mps2 * 1e-3
+        assert s.allowed_mps(START_NS + after_ms * MS) == pytest.approx(30.0 + 2.0 - 0.5 * asked_mps, abs=1e-6)
+
+
+def test_a_car_that_stands_is_never_too_fast():
+    s = stop(COMFORT_STOP, speed_mps=5.0)
+    assert s.allowed_mps(START_NS + 100_000 * MS) == 0.1
 
 
 def test_a_demand_is_a_value():
