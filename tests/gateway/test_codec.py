@@ -112,6 +112,8 @@ def test_demands_have_the_steps_of_the_dbc(tmp_path, monkeypatch):
     catalogue = load()
     monkeypatch.setattr(catalogue, "resolution", lambda name, signal: (0.0, 0.3))  # all in floating point
     assert Codec(catalogue, LIMITS).resolution == Resolution()
+    monkeypatch.setattr(catalogue, "resolution", lambda name, signal: (0.0, 0.3) if name == "SR_Command" else (0.5, 0.0))
+    assert Codec(catalogue, LIMITS).resolution == Resolution(accelerator_norm=0.005, brake_norm=0.005)
 
 
 @pytest.mark.parametrize("demand", STEPS)

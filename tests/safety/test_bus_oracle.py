@@ -22,6 +22,7 @@ class Script:
         self.oracle = BusOracle(**options)
         self.now_ns = 1_000 * MS
         self.speed_mps = 20.0
+        self.wheels_mps = 0.0
         self.angle_deg = self.drive_percent = self.brake_percent = 0.0
         self.request, self.is_following, self.is_enabled = "Disarm", False, False
         self.age_ms = 20.0
@@ -53,6 +54,8 @@ class Script:
             self.now_ns += TICK_NS
             self.question = (self.question + 3) % 256
             self.car("VelocityLevel", {"VelForward": self.speed_mps})
+            wheel_radps = self.wheels_mps / 0.31
+            self.car("CAR_WheelSpeeds", dict.fromkeys(("FrontLeft", "FrontRight", "RearLeft", "RearRight"), wheel_radps))
             self.car("RC_SafetyStatus", {"WatchdogQuestion": self.question})
             for _ in range(self.repeats):
                 self.speak()
@@ -256,6 +259,20 @@ def _ramp(name, step, ticks, **changes):
         return script
 
     return break_it
+
+
+@pytest.mark.parametrize(("profile", "rules"), [("nominal", {"lateral jerk", "lateral acceleration"}), ("bench", set())])
+def test_the_wheels_count_where_they_are_on_the_road(profile, rules):
+    """Navigation says that the car stands."""
+    script = Script(profile=profile)
+    script.max_speed_kmh = 30.0
+    script.engage()
+    script.speed_mps, script.wheels_mps = 0.0, 20.0
+    script.tick(20)
+    for _ in range(40):
+        script.angle_deg += 1.0
+        script.tick()
+    assert script.rules == rules
 
 
 def _window():
@@ -508,7 +525,7 @@ def test_the_limits_written_down_twice_are_the_same(name):
     ours = (
         angle_deg, math.degrees(profile.steering_wheel_rate_radps), profile.lateral_acceleration_mps2, profile.lateral_jerk_mps3,
         profile.acceleration_mps2, profile.deceleration_mps2, profile.drive_jerk_mps3, profile.brake_jerk_mps3,
-        3.6 * 1.1 * profile.max_speed_mps,
+        3.6 * 1.1 * profile.max_speed_mps, profile.are_wheels_on_the_road,
     )
     assert ours == pytest.approx(tuple(vars(envelope).values()), rel=0.01)
     assert set(ENVELOPES) == set(PROFILES)

@@ -7,6 +7,7 @@ nothing but the DBC files and `oracle_limits`. It shares no code with the produc
 from collections import deque
 from dataclasses import dataclass, field
 from functools import cache
+from statistics import median
 from typing import NamedTuple
 
 from tests.support.oracle_limits import (
@@ -170,6 +171,9 @@ class BusOracle:
     def _learn(self, t_ns: int, message: WireMessage, data: bytes) -> None:
         if message.name == "VelocityLevel":
             self._seen.note_speed(t_ns, message.value(data, "VelForward"))
+        elif message.name == "CAR_WheelSpeeds":
+            wheels_radps = [message.value(data, signal) for signal in ("FrontLeft", "FrontRight", "RearLeft", "RearRight")]
+            self._seen.note_wheels(t_ns, median(wheels_radps) * self._car.wheel_radius_m)
         elif message.name == "AccelLevel":
             self._seen.felt_deceleration_mps2 = -message.value(data, "AccelForward")
         elif message.data_id is not None and profile2_crc(data, message.data_id) == data[0]:

@@ -13,7 +13,7 @@ from dbc.health import BusState, LinkHealth
 from gateway.conditions import Surroundings
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, VehicleState
 from tests.support.campaign import MS, TICK_NS, Frames, Tap, World, catalogue
-from tests.support.taps import Edit, freeze, lose, randomly, rewrite, wire
+from tests.support.taps import Edit, freeze, later_and_later, lose, randomly, rewrite, wire
 
 NAVIGATION_MESSAGES = ("PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "AccelLevel", "MilliTime")
 PROTECTED_MESSAGES = ("RC_SafetyStatus", "SR_Status", "AR_Status", "BR_Status")
@@ -196,6 +196,13 @@ def implausible(*taps: Callable[[random.Random], Tap]) -> Callable[[World], None
         world.mark(at_ns, "F8")
 
     return inject
+
+
+def navigation_lags(world: World) -> None:
+    """The delay of the navigation data creeps up; beyond their timeout it counts."""
+    at_ns, growth = random_time(world), world.rng.uniform(0.05, 0.5)
+    world.taps.append((at_ns, later_and_later(NAVIGATION_MESSAGES, at_ns, growth)))
+    world.mark(at_ns + round(50 * MS / growth), "F9")
 
 
 def either(rng: random.Random, low: float, high: float) -> float:

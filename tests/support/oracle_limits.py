@@ -3,7 +3,7 @@
 "Issue" is the issue that the gateway was built for, "B2", "B3" its acceptance list (docs/safety.md has both in its tables).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 MS = 1_000_000
@@ -15,6 +15,7 @@ class Car:
     """The car that the limits are about; defaults are those of dbc/focus.toml."""
 
     wheelbase_m: float = 2.648
+    wheel_radius_m: float = 0.31
     steering_ratio: float = 14.7
     mass_kg: float = 1500.0
     full_drive_force_n: float = 4838.7
@@ -31,6 +32,7 @@ class Envelope:
         acceleration_mps2, deceleration_mps2: that the pedal demands stand for.
         drive_jerk_mps3, brake_jerk_mps3: how fast the accelerator may be pressed, and the brake pressed or released.
         max_speed_kmh: largest value of GW_SafetyCommand.MaxSpeed.
+        is_on_the_road: whether the wheels turn with the car.
     """
 
     steering_wheel_limit_deg: float
@@ -42,6 +44,7 @@ class Envelope:
     drive_jerk_mps3: float
     brake_jerk_mps3: float
     max_speed_kmh: float
+    is_on_the_road: bool = True
 
 
 ENVELOPES = {
@@ -77,9 +80,10 @@ ENVELOPES = {
         drive_jerk_mps3=2.0,
         brake_jerk_mps3=20.0,
         max_speed_kmh=33.5,  # 30 km/h, and 10 %
+        is_on_the_road=False,
     ),
 }
-ENVELOPES["lifted"] = ENVELOPES["proving_ground"]  # the virtual car drives there
+ENVELOPES["lifted"] = replace(ENVELOPES["proving_ground"], is_on_the_road=False)  # the virtual car drives there
 
 SAFE_STOP_MPS2, SAFE_STOP_JERK_MPS3 = 2.5, 1.5  # B3, F1
 COMFORT_STOP_MPS2, COMFORT_STOP_JERK_MPS3 = 1.0, 0.3  # decision on issue 5: Autoware's comfortable stop

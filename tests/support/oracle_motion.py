@@ -37,13 +37,16 @@ class CarSeen:
 
     def __init__(self) -> None:
         self._speeds: deque[tuple[int, float]] = deque()
+        self._wheel_speeds: deque[tuple[int, float]] = deque()
         self.felt_deceleration_mps2 = 0.0
 
     def note_speed(self, t_ns: int, speed_mps: float) -> None:
-        """Take in a speed."""
-        self._speeds.append((t_ns, abs(speed_mps)))
-        while self._speeds[0][0] < t_ns - _SPEED_WINDOW_NS and len(self._speeds) > 1:
-            self._speeds.popleft()
+        """Take in a speed of the navigation system."""
+        _remember(self._speeds, t_ns, abs(speed_mps))
+
+    def note_wheels(self, t_ns: int, speed_mps: float) -> None:
+        """Take in a speed of the wheels."""
+        _remember(self._wheel_speeds, t_ns, abs(speed_mps))
 
     @property
     def slowest_mps(self) -> float:
@@ -51,9 +54,20 @@ class CarSeen:
         return min((speed for _, speed in self._speeds), default=0.0)
 
     @property
+    def slowest_wheels_mps(self) -> float:
+        """The same by the wheels."""
+        return min((speed for _, speed in self._wheel_speeds), default=0.0)
+
+    @property
     def fastest_mps(self) -> float:
         """The largest one."""
         return max((speed for _, speed in self._speeds), default=0.0)
+
+
+def _remember(speeds: deque[tuple[int, float]], t_ns: int, speed_mps: float) -> None:
+    speeds.append((t_ns, speed_mps))
+    while speeds[0][0] < t_ns - _SPEED_WINDOW_NS and len(speeds) > 1:
+        speeds.popleft()
 
 
 class MotionJudge:
@@ -133,7 +147,8 @@ class MotionJudge:
 
     def _judge_lateral(self, t_ns: int, angle_deg: float) -> None:
         before_ns, before_deg = self._angles[-1]
-        speed_mps = self._seen.slowest_mps
+        # Of navigation and wheels one may be wrong; the faster counts.
+        speed_mps = max(self._seen.slowest_mps, self._seen.slowest_wheels_mps if self._limits.is_on_the_road else 0.0)
         now_mps2, was_mps2, lsb_mps2 = (self._lateral_mps2(angle, speed_mps) for angle in (angle_deg, before_deg, _STEER_LSB_DEG))
         # A demand that comes back from outside is no violation: the car was handed over like this, or has become faster.
         if abs(now_mps2) > self._limits.lateral_acceleration_mps2 + lsb_mps2 and abs(now_mps2) >= abs(was_mps2):

@@ -47,6 +47,11 @@ def shift(name: str, signal: str, by: float) -> Tap:
     return rewrite(name, edit)
 
 
+def fix(name: str, signal: str, value: float) -> Tap:
+    """A signal has one value for ever, well protected."""
+    return rewrite(name, lambda message, data: message.sealed(message.changed(data, {signal: value}), counter_of(data)))
+
+
 def freeze(name: str) -> Tap:
     """A node repeats its last content with a counter that goes on."""
     frozen: list[bytes] = []
@@ -95,6 +100,12 @@ def overtaken(t_ns: int, frame: CanFrame, rng: random.Random) -> Frames:
 def late(delay_ns: int) -> Tap:
     """Everything comes later."""
     return lambda t_ns, frame, rng: [(t_ns + delay_ns, frame)]
+
+
+def later_and_later(names: Iterable[str], since_ns: int, growth: float) -> Tap:
+    """These messages come ever later: something on their way is too slow for them."""
+    slow = {catalogue().by_name[name].arbitration_id for name in names}
+    return lambda t_ns, frame, rng: [(t_ns + round(growth * (t_ns - since_ns) * (frame.arbitration_id in slow)), frame)]
 
 
 def wrong_crc(message: WireMessage, data: bytes) -> bytes:
