@@ -12,7 +12,7 @@ from dbc.errors import UserMistake
 from dbc.vehicle import Vehicle, load_vehicle
 from gateway.core import GatewayCore
 from gateway.limits import PROFILES, LimitProfile
-from gateway.record.session import gateway_session, pinnable, sha256_of_data
+from gateway.record.session import gateway_session, pinnable, refuse_equal_names, sha256_of_data
 from gateway.recorder import FileOptions, Recorder
 from gateway.rig import Recording, Rig, RigError
 
@@ -47,6 +47,7 @@ def prepare(rig: Rig) -> Preparation:
         UserMistake: files that cannot be used, or that are not what the rig expects; one line per mistake, of all files at once.
     """
     mistakes: list[str] = []
+    _try(lambda: refuse_equal_names(rig.car.dbc, rig.car.vehicle, rig.car.mapping), mistakes)
     catalogue = _try(lambda: load(rig.car.dbc, rig.car.mapping), mistakes)
     vehicle = _try(lambda: load_vehicle(rig.car.vehicle), mistakes)
     profile = PROFILES[rig.profile]

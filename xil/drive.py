@@ -23,6 +23,7 @@ from dbc.catalogue import load
 from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import load_vehicle
 from gateway.core import GatewayCore
+from gateway.record.session import refuse_equal_names
 from gateway.telemetry import StateSample
 from vehicle_emulator.emulator import Emulator
 from vehicle_emulator.faults.targets import check
@@ -200,6 +201,7 @@ def _deferred_interrupt() -> Iterator[threading.Event]:
 def _prepare(options: DriveOptions, display: Display) -> RunSetup:
     """Work out everything that can be wrong before anything starts."""
     scenario = load_scenario(options.scenario)
+    refuse_equal_names(options.dbc_paths, options.vehicle_path, options.mapping_path)
     vehicle = load_vehicle(options.vehicle_path)
     catalogue = load(options.dbc_paths, options.mapping_path)
     check(scenario.faults, catalogue)

@@ -173,14 +173,14 @@ def _resim_gateway(journal: Journal, progress: Progress) -> Comparison:
 def _core_of(session: GatewaySession, profile: LimitProfile) -> tuple[Catalogue, GatewayCore]:
     """The catalogue and a gateway as it was at its start."""
     with tempfile.TemporaryDirectory(prefix="xilgate-") as folder:
-        texts = {name: text.encode("latin-1") for name, text in session.dbc.items()} | {"vehicle.toml": session.vehicle.encode()}
+        texts = {name: text.encode("latin-1") for name, text in session.dbc.items()} | {"vehicle": session.vehicle.encode()}
         if session.mapping is not None:
-            texts["mapping.toml"] = session.mapping.encode()
+            texts["mapping"] = session.mapping.encode()
         for name, content in texts.items():
             (Path(folder) / Path(name).name).write_bytes(content)
-        mapping = None if session.mapping is None else Path(folder) / "mapping.toml"
+        mapping = None if session.mapping is None else Path(folder) / "mapping"
         catalogue = load([Path(folder) / Path(name).name for name in session.dbc], mapping)
-        vehicle = load_vehicle(Path(folder) / "vehicle.toml")
+        vehicle = load_vehicle(Path(folder) / "vehicle")
     return catalogue, GatewayCore(catalogue, vehicle, session.boot_id, profile)
 
 

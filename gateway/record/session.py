@@ -10,11 +10,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypedDict
 
+from dbc.errors import UserMistake
 from gateway.journal import GatewaySession
 from gateway.limits import LimitProfile
 
 _EARLIEST_NS = 946_684_800_000_000_000
 """The year 2000 [ns]: a machine without a clock of its own starts in 1970, which the BLF format cannot tell."""
+_OTHER_NAMES = ("configuration", "controller library", "limits", "mapping", "scenario", "vehicle")
+"""What else has a hash, here and in the summary of a run."""
 
 
 class Origin(TypedDict):
@@ -37,6 +40,24 @@ def origin(boot_id: int, decided_by: Mapping[str, bytes]) -> Origin:
         boot_id=boot_id,
         sha256={name: hashlib.sha256(content).hexdigest() for name, content in decided_by.items()},
     )
+
+
+def refuse_equal_names(dbc_paths: Iterable[Path], vehicle_path: Path, mapping_path: Path | None) -> None:
+    """Refuse files that hashes and journals could not tell apart: both know a file by the last part of its path.
+
+    Raises:
+        UserMistake: two have the same name, or one that stands for something else; one line for each.
+    """
+    by_name: dict[str, Path] = {}
+    mistakes = []
+    for path in (*dbc_paths, vehicle_path, *([] if mapping_path is None else [mapping_path])):
+        if path.name in _OTHER_NAMES:
+            mistakes.append(f"{path}: named as another hash; allowed: any name but {', '.join(_OTHER_NAMES)}")
+        elif path.name in by_name:
+            mistakes.append(f"{path}: named as {by_name[path.name]}, records could not tell them apart; allowed: a name of its own")
+        by_name[path.name] = path
+    if mistakes:
+        raise UserMistake("\n".join(mistakes))
 
 
 def sha256_of_data(content: object) -> str:

@@ -169,6 +169,28 @@ def test_a_dbc_without_the_messages_that_the_gateway_needs(rig_file):
 
 
 @pytest.mark.req("S5")
+def test_files_that_a_record_could_not_tell_apart_are_refused(rig_file, tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    for source, copy in ((ROBOTS_DBC, "a/car.dbc"), (GNSS_IMU_DBC, "b/car.dbc"), (GNSS_IMU_DBC, "limits"), (FOCUS, "a/focus.toml")):
+        shutil.copy(source, tmp_path / copy)
+    (tmp_path / "b" / "focus.toml").write_text("")
+
+    def told(dbc: str, more: str) -> list[str]:
+        text = re.sub(r"car = .*", f"car = {{ dbc = {dbc}, vehicle = 'a/focus.toml'{more} }}", SMALLEST)
+        with pytest.raises(UserMistake) as caught:
+            prepare(read_rig(rig_file(text)))
+        return str(caught.value).splitlines()
+
+    (same,) = told('["a/car.dbc", "b/car.dbc"]', "")
+    assert same == f"{tmp_path}/b/car.dbc: named as {tmp_path}/a/car.dbc, records could not tell them apart; allowed: a name of its own"
+    (same,) = told(f'["{ROBOTS_DBC}", "{GNSS_IMU_DBC}"]', ", mapping = 'b/focus.toml'")
+    assert f"{tmp_path}/b/focus.toml: named as {tmp_path}/a/focus.toml" in same
+    (reserved,) = told('["a/car.dbc", "limits"]', "")
+    assert f"{tmp_path}/limits: named as another hash; allowed: any name but configuration, " in reserved
+
+
+@pytest.mark.req("S5")
 def test_hashes_pin_files_and_limits(rig_file):
     found = prepare(read_rig(rig_file(SMALLEST))).hashes
     pinned = with_hashes(*(f'"{name}" = "{found[name]}"' for name in ("robots.dbc", "focus.toml", "limits", "configuration")))

@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import shutil
 import signal
 import socket
 
@@ -72,6 +73,14 @@ def test_busy_telemetry_port(tmp_path, offset):
 @pytest.mark.parametrize("option", [["--bus", "emulated"], ["--navigation-bus", "emulated"], ["--view"]])
 def test_lockstep_takes_no_bus_and_no_view(tmp_path, option):
     fails(2, "sil", option[0], arguments=["drive", "--stage", "sil", *option, "--out", str(tmp_path)])
+
+
+def test_files_that_a_record_could_not_tell_apart(tmp_path):
+    for folder, dbc in (("a", ROBOTS_DBC), ("b", GNSS_IMU_DBC)):
+        (tmp_path / folder).mkdir()
+        shutil.copy(dbc, tmp_path / folder / "car.dbc")
+    dbc = ["--dbc", str(tmp_path / "a" / "car.dbc"), "--dbc", str(tmp_path / "b" / "car.dbc")]
+    fails(2, "b/car.dbc: named as", "a/car.dbc", arguments=["drive", "--stage", "sil", *dbc, "--out", str(tmp_path / "run")])
 
 
 def test_run_directory_in_use_is_left_alone(tmp_path):
