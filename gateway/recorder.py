@@ -2,7 +2,8 @@
 
 The gateway hands over one packet for each tick and never waits; what does not fit is counted as lost. The recorder lives as long as the
 gateway: the end of the gateway, however it came, is the end of the socket between them, and then the files are completed. So it
-ignores the signals that end the gateway. Twice a second it reports what it has recorded and how full its disk is.
+ignores the signals that end the gateway: systemd sends them to both, and its watchdog's SIGABRT as well. Twice a second it reports what
+it has recorded and how full its disk is.
 """
 
 import contextlib
@@ -230,7 +231,7 @@ def _drain(end: socket.socket, writer: RecordWriter) -> bool:
 
 def main() -> None:
     """The process."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGABRT):
         signal.signal(number, signal.SIG_IGN)
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
     os.nice(_NICE)

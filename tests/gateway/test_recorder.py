@@ -347,7 +347,7 @@ def session_like(head):
 
 def test_the_signals_that_end_a_gateway_do_not_end_its_recorder(tmp_path, recorder):
     recorder, drive = recorder
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGABRT):
         os.kill(recorder.pid, number)
     count, status = feed(recorder, drive, 0.5)
     assert status.is_recording
