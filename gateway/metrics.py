@@ -1,5 +1,8 @@
 """Prometheus metrics of the gateway: a snapshot of its last status and its counters, served on the loopback interface."""
 
+import contextlib
+import socket
+import sys
 import threading
 import time
 from collections.abc import Iterable, Iterator
@@ -110,19 +113,48 @@ def _histogram(name: str, text: str, histogram: Histogram) -> Metric:
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = _REQUEST_TIMEOUT_S
-
     def log_message(self, *_: object) -> None:
         """Nothing: requests are no events."""
 
 
 class _Server(WSGIServer):
     allow_reuse_port = False  # a second gateway must not share it unseen
+    _is_ending = False
+    _request: socket.socket | None = None
 
     def process_request(self, *arguments: Any) -> None:  # noqa: ANN401 - of the standard library
         """Answer one request, and pause."""
         super().process_request(*arguments)
         time.sleep(_PAUSE_S)
+
+    def finish_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
+        """Answer one request within its time, however slowly the other side reads and writes."""
+        self._request = request
+        limit = threading.Timer(_REQUEST_TIMEOUT_S, self._cut)
+        limit.start()
+        try:
+            if not self._is_ending:
+                super().finish_request(request, client_address)
+        finally:
+            limit.cancel()
+            limit.join()
+            self._request = None
+
+    def handle_error(self, *arguments: Any) -> None:  # noqa: ANN401
+        """Nothing where a client went away or was cut off; anything else is our bug."""
+        if not isinstance(sys.exception(), OSError):
+            super().handle_error(*arguments)
+
+    def end(self) -> None:
+        """End, without waiting for whoever is being answered."""
+        self._is_ending = True
+        self._cut()
+        self.shutdown()
+
+    def _cut(self) -> None:
+        if (request := self._request) is not None:
+            with contextlib.suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
 
 
 class MetricsServer:
@@ -146,6 +178,6 @@ class MetricsServer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.shutdown()
+        self._server.end()
         self._thread.join()
         self._server.server_close()

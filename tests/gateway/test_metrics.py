@@ -1,7 +1,9 @@
 """Metrics: what the gateway knows, in the text that Prometheus reads, on the loopback interface alone."""
 
+import contextlib
 import io
 import socket
+import threading
 import time
 import urllib.request
 
@@ -95,6 +97,45 @@ def test_whoever_asks_in_a_loop_or_says_nothing_holds_nobody_up(logs):
         assert time.monotonic() - start_s > 0.12  # a pause after each
         with socket.create_connection(("127.0.0.1", port)):
             assert "ticks_total" in read(port)
+
+
+@contextlib.contextmanager
+def dripping(port):
+    """A client that never comes to the end of its request."""
+    with socket.create_connection(("127.0.0.1", port)) as client:
+        ends = threading.Event()
+
+        def drip():
+            with contextlib.suppress(OSError):
+                client.sendall(b"GET /metrics HTTP/1.1\r\nX: ")
+                while not ends.wait(0.1):
+                    client.sendall(b"x")
+
+        thread = threading.Thread(target=drip)
+        thread.start()
+        yield
+        ends.set()
+        thread.join()
+
+
+def test_a_slow_client_holds_others_up_for_its_time_only(logs, capsys):
+    port = free_base_port()
+    with MetricsServer(port, Pulse(), logs), dripping(port):
+        time.sleep(0.3)
+        start_s = time.monotonic()
+        assert "ticks_total" in read(port)
+        assert 1.0 < time.monotonic() - start_s < 5.0
+    assert capsys.readouterr().err == ""
+
+
+def test_a_slow_client_does_not_hold_up_the_end(logs):
+    port = free_base_port()
+    with contextlib.ExitStack() as client:
+        with MetricsServer(port, Pulse(), logs):
+            client.enter_context(dripping(port))
+            time.sleep(0.3)
+            start_s = time.monotonic()
+        assert time.monotonic() - start_s < 1.0
 
 
 def test_the_port_is_free_after_the_end(logs):
