@@ -1,6 +1,7 @@
 """`xilgate gateway --check`: all that a start would meet, without starting anything."""
 
 import os
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ def check_machine(rig: Rig) -> None:
         SetupFailure: a directory is missing or not writable; one line for each.
     """
     control = rig.control.path
-    if rig.control.key is not None or control.key_file.exists():
+    if rig.control.key is not None or os.path.lexists(control.key_file):
         control.key()
     if rig.telemetry.tls is not None:
         check_files(rig.telemetry.tls)
@@ -68,6 +69,12 @@ def _flat(prefix: str, tree: dict[str, Any]) -> list[str]:
 
 
 def _unusable(key: str, directory: Path) -> list[str]:
-    if not directory.is_dir():
+    try:
+        is_directory = stat.S_ISDIR(directory.stat().st_mode)
+    except FileNotFoundError:
+        is_directory = False
+    except OSError as error:  # a directory above it that may not be entered, for one
+        return [f"{key} = '{directory}': {error.strerror}"]
+    if not is_directory:
         return [f"{key} = '{directory}': there is no such directory"]
     return [] if os.access(directory, os.W_OK | os.X_OK) else [f"{key} = '{directory}': not writable for this user"]

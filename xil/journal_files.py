@@ -1,6 +1,7 @@
 """Journals as they lie in a directory: the files of each session, in their order."""
 
 import re
+import stat
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO, TypeVar
@@ -115,13 +116,15 @@ def find_journals(path: Path) -> list[Journal]:
     Raises:
         JournalError: there is none, or its beginning is gone.
     """
-    if not path.exists():
-        raise JournalError(f"{path}: no such file or directory")
-    if path.is_dir():
-        files = [file for file in path.iterdir() if _FILE_NAME.fullmatch(file.name)]
-    else:
+    try:
+        is_directory = stat.S_ISDIR(path.stat().st_mode)
+        there = list((path if is_directory else path.parent).iterdir())
+    except OSError as error:
+        raise JournalError(f"{path}: {error.strerror}") from error
+    files = [file for file in there if _FILE_NAME.fullmatch(file.name)]
+    if not is_directory:
         _index_of(path)
-        files = [file for file in path.parent.glob("*.journal") if file.name.startswith(path.name.rpartition("-")[0] + "-")]
+        files = [file for file in files if file.name.startswith(path.name.rpartition("-")[0] + "-")]
     by_stem: dict[str, list[Path]] = {}
     for file in sorted(files, key=lambda file: (file.name.rpartition("-")[0], _index_of(file))):
         by_stem.setdefault(file.name.rpartition("-")[0], []).append(file)

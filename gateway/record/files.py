@@ -72,10 +72,14 @@ class FileOptions:
         """Refuse to write into the files of another recording.
 
         Raises:
-            SetupFailure: there is one of this name.
+            SetupFailure: there is one of this name, or nobody can tell.
         """
-        for suffix in self.suffixes:
-            if (first := self.path(0, suffix)).exists():
+        for first in (self.path(0, suffix) for suffix in self.suffixes):
+            try:
+                is_there = first.exists()
+            except OSError as error:
+                raise SetupFailure(f"{self.directory}: {error.strerror}") from error
+            if is_there:
                 raise SetupFailure(f"{first}: there is such a record already; choose another directory")
 
     def family(self, suffix: str) -> list[Path]:

@@ -15,8 +15,10 @@ from dbc.vehicle import FOCUS
 from gateway import check
 from gateway.limits import PROFILES
 from gateway.preparation import configuration, prepare
+from gateway.record.files import FileOptions
 from gateway.record.session import gateway_session
 from gateway.rig import Rig, RigError, make_rig, read_rig
+from tests.support.privilege import may_not_enter
 
 EXAMPLE = Path(__file__).parents[2] / "gateway" / "target" / "rig.toml"
 SMALLEST = f"""
@@ -251,6 +253,19 @@ def test_directories_that_are_not_there_are_set_up_failures(rig_file, tmp_path):
     with pytest.raises(SetupFailure) as caught:
         check.check_machine(read_rig(rig_file(SMALLEST + sections)))
     assert [line.split(" = ")[0] for line in str(caught.value).splitlines()] == ["control.directory", "recorder.directory"]
+
+
+def test_directories_that_may_not_be_entered_are_set_up_failures(rig_file, tmp_path):
+    closed = tmp_path / "closed"
+    rig = read_rig(rig_file(SMALLEST + f'control = {{ directory = "{closed}" }}\nrecorder = {{ directory = "{closed}/b" }}'))
+    with may_not_enter(closed):
+        with pytest.raises(SetupFailure) as checked:
+            check.check_machine(rig)
+        with pytest.raises(SetupFailure) as started:
+            FileOptions(closed / "b", "gateway").refuse_existing()
+    assert f"recorder.directory = '{closed}/b': Permission denied" in str(checked.value).splitlines()
+    assert f"control.directory = '{closed}': " in str(checked.value)
+    assert str(started.value) == f"{closed}/b: Permission denied"
 
 
 def test_a_check_makes_no_key_and_no_socket(rig_file, tmp_path):

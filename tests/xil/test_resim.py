@@ -21,6 +21,7 @@ from controller.solvers import make_solver
 from dbc.vehicle import FOCUS, load_vehicle
 from gateway.journal import JournalError, JournalReader, pack_blocks, pack_value
 from gateway.messages import PLAN_PERIOD_NS, CommandStatus
+from tests.support.privilege import may_not_enter
 from tests.support.processes import xilgate
 from xil import resim as again
 from xil.cli import app
@@ -172,8 +173,16 @@ def test_a_mistake_is_one_line_and_exit_code_2(tmp_path):
     assert finished.returncode == 2
     assert finished.stderr.startswith(f"xilgate: {tmp_path}: no journal")
     assert len(finished.stderr.splitlines()) == 1
-    with pytest.raises(JournalError, match=r"/nothing/there: no such file or directory$"):
+    with pytest.raises(JournalError, match=r"/nothing/there: No such file or directory$"):
         resim(tmp_path / "nothing" / "there", silent)
+
+
+def test_a_directory_that_may_not_be_entered_is_told(tmp_path):
+    closed = tmp_path / "closed"
+    with may_not_enter(closed):
+        for path in (closed, closed / "records", closed / "gateway-0000.journal"):
+            with pytest.raises(JournalError, match=f"{path}: Permission denied"):
+                find_journals(path)
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -1,6 +1,7 @@
 """A car that is an FMU: what Amesim, CarMaker and others export for co-simulation, FMI 2.0 or 3.0."""
 
 import math
+import os
 from pathlib import Path
 from typing import Self
 
@@ -42,7 +43,7 @@ class FmuPlant:
         *,
         mapping: Path | None = None,
     ) -> None:
-        if not path.is_file():
+        if not os.path.isfile(path):
             raise FmuUnusable(f"{path}: no such file")
         mapping_path = mapping or path.with_suffix(".toml")
         content = load_mapping(mapping_path)

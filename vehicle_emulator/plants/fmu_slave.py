@@ -1,6 +1,7 @@
 """A co-simulation FMU of FMI 2.0 or 3.0, unpacked, loaded and running; built on the library fmpy."""
 
 import ctypes
+import os
 import shutil
 import tempfile
 import weakref
@@ -161,7 +162,7 @@ class FmuSlave:
         self._time_s += duration_s
 
     def _description(self, fmpy: Any) -> Any:  # noqa: ANN401 - fmpy has no types
-        if not self._path.is_file():
+        if not os.path.isfile(self._path):
             raise FmuUnusable(f"{self._path}: no such file")
         if not zipfile.is_zipfile(self._path):
             raise FmuUnusable(f"{self._path}: no FMU: not a ZIP archive")

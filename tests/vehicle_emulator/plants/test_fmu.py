@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from dbc.vehicle import load_vehicle
+from tests.support.privilege import may_not_enter
 from vehicle_emulator.plants import extras
 from vehicle_emulator.plants.column import SteeringWheel
 from vehicle_emulator.plants.extras import ExtraMissing
@@ -303,6 +304,8 @@ def test_files_that_are_no_fmu_for_here_are_refused(car_3, tmp_path):
         return str(caught.value)
 
     assert refusal(tmp_path / "none.fmu") == f"{tmp_path / 'none.fmu'}: no such file"
+    with may_not_enter(closed := tmp_path / "closed"):
+        assert refusal(closed / "car.fmu") == f"{closed / 'car.fmu'}: no such file"
     assert refusal(mapping) == f"{mapping}: no FMU: not a ZIP archive"
     other = tmp_path / "other.fmu"
 
