@@ -1,5 +1,6 @@
 """`xilgate drive`: set up, drive on the stage that was asked for, judge, report."""
 
+import errno
 import fcntl
 import json
 import os
@@ -43,6 +44,9 @@ SOLVER_OF_STAGE = {Stage.MIL: "casadi-vm"} | dict.fromkeys((Stage.SIL, Stage.HIL
 """MiL runs the controller as it was modelled; from SiL on it is the compiled library."""
 OUTCOMES = ("summary.json", "report.html", "bus.log", "gateway-*.journal", "controller-*.journal")
 """What a run concludes with; the next one in the same directory starts without them."""
+
+_REFUSALS_OF_A_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
+"""A write that fails does not know the name of its file."""
 
 
 @dataclass(frozen=True)
@@ -114,9 +118,9 @@ def run_drive(options: DriveOptions) -> Verdict:
             _write_inputs(setup, options)
             return _run(setup, options, display)
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno not in _REFUSALS_OF_A_DISK:
             raise
-        raise SetupFailure(f"{error.filename}: {error.strerror}") from error
+        raise SetupFailure(f"{error.filename or setup.directory}: {error.strerror}") from error
 
 
 @dataclass(frozen=True)

@@ -92,6 +92,11 @@ def test_run_directory_in_use_is_left_alone(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["summary.json"]
 
 
+def test_a_full_disk(tmp_path):
+    (tmp_path / "configuration.json").symlink_to("/dev/full")
+    fails(3, f"{tmp_path}: No space left on device", arguments=["drive", "--stage", "sil", "--out", str(tmp_path)])
+
+
 @pytest.mark.parametrize("stage", ["mil", "sil"])
 def test_interrupted_run_leaves_no_verdict_of_an_earlier_one(tmp_path, stage):
     (tmp_path / "summary.json").write_text("stale")
