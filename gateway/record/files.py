@@ -83,9 +83,16 @@ class FileOptions:
                 raise SetupFailure(f"{first}: there is such a record already; choose another directory")
 
     def family(self, suffix: str) -> list[Path]:
-        """The files of one suffix that `max_files` bounds, oldest first."""
-        found = self.directory.glob(f"{self.stem.partition('-')[0]}-*.{suffix}")
-        return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+        """The files of one suffix that `max_files` bounds, oldest first: our own are the newest, whatever the clock says."""
+        by_stem: dict[str, list[Path]] = {}
+        for path in self.directory.glob(f"{self.stem.partition('-')[0]}-*.{suffix}"):
+            by_stem.setdefault(path.stem.rpartition("-")[0], []).append(path)
+
+        def age(stem: str) -> tuple[bool, int, str]:
+            return stem == self.stem, max(path.stat().st_mtime_ns for path in by_stem[stem]), stem
+
+        # Of one stem the shorter number is the smaller one.
+        return [path for stem in sorted(by_stem, key=age) for path in sorted(by_stem[stem], key=lambda path: (len(path.name), path.name))]
 
 
 def append_whole(path: Path, content: bytes) -> None:

@@ -127,6 +127,21 @@ def test_files_rotate_by_size_and_time_and_their_number_is_bounded(tmp_path, sou
     assert journal(tmp_path / "gateway-0006.journal")[1][-1].seq == source.seq - 1
 
 
+def test_a_clock_that_is_behind_costs_no_file_of_this_session(tmp_path, source):
+    later_s = time.time() + 1e6
+    earlier = [tmp_path / f"gateway-20300101T000000Z-{index}.journal" for index in ("9998", "9999", "10000")]
+    for number, path in enumerate(reversed(earlier)):
+        path.touch()
+        os.utime(path, (later_s + number, later_s + number))
+    options = FileOptions(tmp_path, "gateway-20260101T000000Z", max_file_s=10.0, max_files=4)
+    files = RecordFiles(options, pack_value(session()), networks(source.drive.catalogue), WALL_NS)
+    own = [options.path(index, "journal") for index in range(3)]
+    for number, left in enumerate([[*earlier, own[0]], [*earlier[1:], *own[:2]], [earlier[2], *own]]):
+        files.append(source.records(1), number * 10.0)
+        assert set(tmp_path.iterdir()) == set(left)
+    assert options.family("journal") == [earlier[2], *own]
+
+
 def test_a_file_that_is_large_enough_is_followed_by_another(tmp_path, source):
     files = files_in(tmp_path, source, max_file_bytes=60_000)  # the head of a journal alone takes some 20,000
     for number in range(8):
