@@ -183,6 +183,8 @@ class Housekeeper:
         except (UserMistake, SetupFailure) as error:
             for line in str(error).splitlines():
                 log.error("reload refused: %s", line)
+        except Exception as error:  # our bug; but whoever feeds the watchdog goes on, and the gateway with what it has
+            log.exception("reload refused: %s", repr(error))
 
     def __enter__(self) -> Self:
         self._thread.start()

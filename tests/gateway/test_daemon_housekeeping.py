@@ -191,6 +191,24 @@ def test_a_reload_that_cannot_be_is_refused_in_the_log(notifier, caplog, prepare
 
 
 @pytest.mark.req("S5")
+def test_a_reload_that_meets_a_bug_of_ours_is_refused_and_the_watchdog_fed(manager, notifier, caplog):
+    def bug():
+        raise ValueError("embedded null byte")
+
+    bench = CycleBench()
+    with housekeeper(bench.pulse, bench.orders, notifier, bug), Loop(bench.pulse):
+        bench.tick(10)
+        bench.orders.is_reload_asked = True
+        wait_until(lambda: not bench.orders.is_reload_asked, 5, "the reload")
+        manager.hear(0.3)
+        manager.heard.clear()
+        manager.hear(0.3)
+        assert "WATCHDOG=1" in manager.texts
+    (record,) = [record for record in caplog.records if "reload" in record.message]
+    assert record.message == "reload refused: ValueError('embedded null byte')"
+    assert record.exc_info
+
+
 def test_a_reload_while_engaged_is_refused_without_reading_anything(notifier, caplog):
     bench = CycleBench().engage()
     with caplog.at_level(logging.INFO), housekeeper(bench.pulse, bench.orders, notifier, lambda: pytest.fail("was read")):
