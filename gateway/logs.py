@@ -70,7 +70,7 @@ class LogThread(logging.Handler):
     No lock is taken when a record is handed over: a thread of low priority that holds one would keep the control thread waiting.
 
     Attributes:
-        dropped: records lost because the writing did not keep up.
+        dropped: records lost because the writing did not keep up, or was refused.
     """
 
     def __init__(self, formatter: logging.Formatter, stream: TextIO = sys.stderr) -> None:
@@ -102,9 +102,13 @@ class LogThread(logging.Handler):
         lines = []
         while self._records:
             lines.append(self.format(self._records.popleft()) + "\n")
-        if lines:
+        if not lines:
+            return
+        try:
             self._stream.write("".join(lines))
             self._stream.flush()
+        except OSError:  # a full disk, or a reader that has gone: neither may be for good
+            self.dropped += len(lines)
 
     def __enter__(self) -> Self:
         root = logging.getLogger()

@@ -1,5 +1,6 @@
 """Logs: one JSON object a line, never waited for, never anybody else's line."""
 
+import errno
 import io
 import json
 import logging
@@ -76,6 +77,26 @@ def test_what_is_too_much_is_dropped_and_counted_and_nobody_waits():
         assert logs.dropped == 7
         gate.set()
     assert len(stream.getvalue().splitlines()) == 1 + QUEUE_LENGTH
+
+
+def test_what_the_disk_refuses_is_counted_and_the_log_goes_on():
+    class Full(io.StringIO):
+        is_full = True
+
+        def write(self, text):
+            if self.is_full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            return super().write(text)
+
+    stream = Full()
+    with LogThread(PlainFormatter(), stream) as logs:
+        log.info("one")
+        log.info("two")
+        wait_until(lambda: logs.dropped == 2, 5, "the refusal")
+        stream.is_full = False
+        log.info("three")
+    assert [line[-5:] for line in stream.getvalue().splitlines()] == ["three"]
+    assert logs.dropped == 2
 
 
 def test_handing_over_takes_no_lock():
