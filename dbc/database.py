@@ -13,6 +13,7 @@ from cantools.database.can.message import Message
 from cantools.database.errors import Error as CantoolsError
 
 from dbc.errors import UserMistake
+from dbc.whole_file import read_whole
 
 ROBOTS, NAVIGATION = NETWORKS = ("robots", "navigation")
 """The buses of a car with driving robots: what `BusName` of a DBC file may say."""
@@ -64,7 +65,7 @@ def read_dbc(path: Path, is_strict: bool = True) -> DbcFile:
         CatalogueError: the file is not there, is no DBC, or names a bus that cannot be; the text has the path.
     """
     try:
-        content = path.read_bytes()
+        content = read_whole(path, _MAX_FILE_BYTES)
         text = content.decode("latin-1")
         _refuse_absurd(path, text)
         database = cantools.database.load_string(text, database_format="dbc", strict=is_strict)
@@ -83,8 +84,6 @@ def _refuse_absurd(path: Path, text: str) -> None:
     Raises:
         CatalogueError: there is one.
     """
-    if len(text) > _MAX_FILE_BYTES:
-        raise CatalogueError(f"{path}: {len(text)} bytes: allowed: up to {_MAX_FILE_BYTES}")
     outside_texts = _TEXT.sub('""', text)
     if found := _ABSURD_NUMBER.search(outside_texts):
         raise CatalogueError(f"{path}: not a usable DBC: number too large: {found[0].strip()[:_SHOWN]}")

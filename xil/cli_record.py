@@ -49,7 +49,7 @@ def replay(
 
 def _wait(stop: threading.Event, duration_ns: int) -> None:
     """Sleep, but not longer than until somebody wants an end."""
-    stop.wait(duration_ns * 1e-9)
+    stop.wait(min(duration_ns * 1e-9, threading.TIMEOUT_MAX))
 
 
 @records.command()

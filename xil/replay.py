@@ -6,6 +6,7 @@ The frames of each channel keep their order; channels are merged by time, as the
 
 import contextlib
 import heapq
+import os
 import struct
 import time
 import zlib
@@ -31,6 +32,8 @@ _LARGEST_ID = (1 << 29) - 1
 _NS_PER_S = 1_000_000_000
 _MERGE_WINDOW_NS = _NS_PER_S
 """By how much the channels of a record may be out of step with each other [ns]: far above what listeners of several buses are."""
+_LATEST_S = 1e11
+"""Three thousand years [s]."""
 _RETRY_NS = 1_000_000
 _PATIENCE_NS = 5 * _NS_PER_S
 """Time for which a bus may refuse a frame [ns]."""
@@ -72,10 +75,14 @@ def _messages(path: Path) -> Iterator[can.Message]:
     reader = _READERS.get(path.suffix.lower())
     if reader is None:
         raise RecordError(f"{path}: a bus record ends in {', '.join(_READERS)}")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise RecordError(f"{path}: not a regular file")
     count = 0
     try:
         with reader(path) as messages:
             for message in messages:
+                if not abs(message.timestamp) <= _LATEST_S:
+                    raise ValueError(f"time {message.timestamp} s")
                 count += 1
                 yield message
     except OSError as error:

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dbc.errors import UserMistake
+from dbc.whole_file import read_whole
 
 Array = NDArray[np.float64]
 
 _COLUMNS = ("x_m", "y_m", "yaw_rad", "speed_mps", "left_m", "right_m")
+_MAX_FILE_BYTES = 64 << 20
 
 SHORTEST_STEP_M = 1e-6
 """Distance by which every sample must advance."""
@@ -61,10 +63,10 @@ class ReferencePath:
             ReferencePathError: the file cannot be read, or its content breaks a rule.
         """
         try:
-            rows = list(csv.reader(path.read_text(encoding="utf-8").splitlines()))
+            rows = list(csv.reader(read_whole(path, _MAX_FILE_BYTES).decode("utf-8").splitlines()))
         except OSError as error:
             raise ReferencePathError(f"{path}: {error.strerror or error}") from error
-        except UnicodeDecodeError as error:
+        except (UnicodeDecodeError, csv.Error) as error:
             raise ReferencePathError(f"{path}: {error}") from error
         if not rows or tuple(name.strip() for name in rows[0]) != _COLUMNS:
             raise ReferencePathError(f"{path}: the first line must be {','.join(_COLUMNS)}")

@@ -12,10 +12,12 @@ from pydantic import AfterValidator, Field
 
 from dbc.errors import UserMistake
 from dbc.section import Section, absolute, misfit, read_section
+from dbc.whole_file import read_whole
 from gateway.keys import check_secret
 from gateway.telemetry.samples import Source, port_of
 
 KEY_PREFIX = "xilgate"
+_MAX_CERTIFICATE_BYTES = 1 << 20
 _ADDRESS = re.compile(r"(?:[A-Za-z0-9.-]{1,253}|\[[0-9A-Fa-f:.]{2,45}\]):([0-9]{4,5})")
 _PORTS = range(1024, 65536 - len(Source))
 _EVERYTHING = [
@@ -86,7 +88,7 @@ def check_files(tls: TlsSection) -> None:
     """
     for path in (tls.certificate, tls.authority):
         try:
-            path.read_bytes()
+            read_whole(path, _MAX_CERTIFICATE_BYTES)
         except OSError as error:
             raise TlsMistake(f"{path}: {error.strerror}") from error
     check_secret(tls.private_key)

@@ -1,6 +1,7 @@
 """What a DBC file may be, and what is refused in one line."""
 
 import random
+from pathlib import Path
 
 import pytest
 
@@ -227,6 +228,11 @@ def test_a_file_that_would_take_all_memory_is_refused_before_it_is_parsed(tmp_pa
         read_dbc(path, is_strict)
     assert str(caught.value).startswith(f"{path}: ")
     assert len(str(caught.value)) < len(str(path)) + 100
+
+
+def test_a_device_is_no_dbc():
+    with pytest.raises(CatalogueError, match=r"^/dev/zero: not a regular file$"):
+        read_dbc(Path("/dev/zero"))
 
 
 def test_large_numbers_that_mean_something_are_read(tmp_path):

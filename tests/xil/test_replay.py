@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from dbc.catalogue import load
 from dbc.errors import SetupFailure, UserMistake
 from tests.support.processes import xilgate
+from xil.cli_record import _wait
 from xil.replay import Player, RecordedFrame, RecordError, Selection, contents, open_buses, read_record, select
 
 CATALOGUE = load()
@@ -276,6 +277,28 @@ def test_what_is_no_record_is_one_clear_line(tmp_path, name):
     (tmp_path / "directory.log").mkdir()
     with pytest.raises(RecordError, match=name):
         list(read_record(tmp_path / name))
+
+
+@pytest.mark.parametrize("time_s", ["inf", "-inf", "nan", "1e300"])
+def test_a_time_that_is_none_is_one_clear_line(tmp_path, time_s):
+    path = tmp_path / "record.log"
+    path.write_text(f"(1.0) can0 123#00\n({time_s}) can0 123#00\n")
+    with pytest.raises(RecordError, match=r"record\.log: no record of this format after 1 frames: time -?(inf|nan|1e\+300) s$"):
+        list(read_record(path))
+
+
+@pytest.mark.timeout(20)
+def test_a_device_is_no_record(tmp_path):
+    (tmp_path / "record.log").symlink_to("/dev/zero")
+    with pytest.raises(RecordError, match=r"record\.log: not a regular file$"):
+        list(read_record(tmp_path / "record.log"))
+
+
+def test_a_gap_of_centuries_is_waited_in_until_somebody_wants_an_end():
+    stop = threading.Event()
+    threading.Timer(0.1, stop.set).start()
+    _wait(stop, 1000 * 365 * 86_400 * S)
+    assert stop.is_set()
 
 
 CORPUS = {}
