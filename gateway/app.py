@@ -45,7 +45,12 @@ def run(
         channel = opened.enter_context(Channel(control.gateway_socket, control.controller_socket, key))
         buses = opened.enter_context(BusSet(rig.buses.by_network, preparation.catalogue, OWN_NODE))
         if rig.metrics is not None:
-            opened.enter_context(MetricsServer(rig.metrics.port, pulse, logs))
+            unsent = {
+                "controller": lambda: channel.unsent,
+                "operator": lambda: operators.unsent,
+                "telemetry": lambda: telemetry.dropped,
+            }
+            opened.enter_context(MetricsServer(rig.metrics.port, pulse, logs, unsent))
         opened.enter_context(Housekeeper(pulse, orders, notifier, rig.daemon.watchdog_s, prepare))
         pulse.realtime = opened.enter_context(realtime_practice(rig.realtime))
         links = Links(buses, channel, operators, telemetry, recorder)

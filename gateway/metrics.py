@@ -5,8 +5,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import accumulate
+from types import MappingProxyType
 from typing import Any, Self
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
@@ -29,17 +30,24 @@ _PAUSE_S = 0.05
 _POLL_S = 0.1
 _S_PER_NS = 1e-9
 
+Unsent = Mapping[str, Callable[[], int]]
+
 
 class MetricsError(SetupFailure):
     """The port of the metrics cannot be opened; one line that says which."""
 
 
 class GatewayCollector(Collector):
-    """Makes metrics out of what the control thread has left, when somebody asks for them."""
+    """Makes metrics out of what the control thread has left, when somebody asks for them.
 
-    def __init__(self, pulse: Pulse, logs: LogThread) -> None:
+    Args:
+        unsent: by whom it was for, how to read what was handed over and did not leave.
+    """
+
+    def __init__(self, pulse: Pulse, logs: LogThread, unsent: Unsent) -> None:
         self._pulse = pulse
         self._logs = logs
+        self._unsent = unsent
 
     def collect(self) -> Iterator[Metric]:
         """All metrics of the moment."""
@@ -48,6 +56,10 @@ class GatewayCollector(Collector):
         yield _histogram("step_cpu_seconds", "CPU time of a tick.", pulse.step_cpu)
         yield _counter("ticks", "Ticks since the start.", pulse.ticks)
         yield _counter("log_records_dropped", "Log records lost.", self._logs.dropped + pulse.events_dropped)
+        yield _labelled(
+            CounterMetricFamily, "messages_unsent", "Datagrams and samples that nobody took.", "to",
+            {name: count() for name, count in self._unsent.items()},
+        )  # fmt: skip
         yield _labelled(
             GaugeMetricFamily, "realtime_granted", "1 where what was asked of the machine was granted.", "what",
             {name: float(not grant.refusal) for name, grant in pulse.realtime.items()},
@@ -160,13 +172,16 @@ class _Server(WSGIServer):
 class MetricsServer:
     """Serves the metrics of one gateway from a thread of its own, one request at a time.
 
+    Args:
+        unsent: see `GatewayCollector`.
+
     Raises:
         MetricsError: the port is not free.
     """
 
-    def __init__(self, port: int, pulse: Pulse, logs: LogThread) -> None:
+    def __init__(self, port: int, pulse: Pulse, logs: LogThread, unsent: Unsent = MappingProxyType({})) -> None:
         registry = CollectorRegistry(auto_describe=False)
-        registry.register(GatewayCollector(pulse, logs))
+        registry.register(GatewayCollector(pulse, logs, unsent))
         try:
             self._server = make_server("127.0.0.1", port, make_wsgi_app(registry), _Server, _Handler)
         except OSError as error:

@@ -152,6 +152,9 @@ class Publisher:
     Raises:
         TelemetryError: the port of the source is busy, or TLS cannot be used.
         KeyMistake: others can read the private key.
+
+    Attributes:
+        dropped: samples lost because the thread did not keep up.
     """
 
     def __init__(self, source: Source, base_port: int = DEFAULT_BASE_PORT, tls: TlsSection | None = None) -> None:
@@ -165,13 +168,15 @@ class Publisher:
         self._services: list[zenoh.Queryable[None]] = []
         self._encoder = msgspec.json.Encoder()
         self._queue: deque[Sample] = deque(maxlen=_QUEUE_LENGTH)
+        self.dropped = 0
         self._wake = threading.Event()
         self._is_closing = False
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
         self._thread.start()
 
     def post(self, sample: Sample) -> None:
-        """Hand a sample over; never blocks. When the thread cannot keep up, the oldest samples are lost."""
+        """Hand a sample over; never blocks. When the thread cannot keep up, the oldest samples are lost, and counted."""
+        self.dropped += len(self._queue) == _QUEUE_LENGTH
         self._queue.append(sample)
         self._wake.set()
 

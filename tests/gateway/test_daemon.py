@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -110,6 +111,8 @@ def test_life_of_a_daemon(hub, rig):
     rig.wait_for("STATUS=SILENT: started")
     rig.wait_for("WATCHDOG=1", times=5)
     assert 'mode{mode="SILENT"} 1.0' in rig.metrics()
+    assert re.search(r'messages_unsent_total\{to="controller"\} [1-9]', rig.metrics())  # there is none
+    assert re.search(r'messages_unsent_total\{to="telemetry"\} 0', rig.metrics())
 
     rig.write(more="speed = 3")
     rig.signal(signal.SIGHUP)

@@ -45,11 +45,12 @@ def test_a_gateway_that_drives(logs):
     bench.pulse.lateness.observe(10**9)
     logs.dropped = 3
     port = free_base_port()
-    with MetricsServer(port, bench.pulse, logs):
+    with MetricsServer(port, bench.pulse, logs, {"operator": lambda: 2}):
         found = samples(read(port))
     prefix = "xilgate_gateway_"
     assert found[prefix + "mode", "ENGAGED"] == 1.0
     assert found[prefix + "mode", "SILENT"] == 0.0
+    assert found[prefix + "messages_unsent_total", "operator"] == 2.0
     assert found[(prefix + "ticks_total",)] == bench.pulse.ticks
     assert found[(prefix + "frames_received_total",)] == bench.pulse.status.frames_received > 0
     assert found[prefix + "bus_state", "error-active", "robots"] == 1.0

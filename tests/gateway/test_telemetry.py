@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -40,6 +41,23 @@ WORLD = WorldSample(
     t_ns=1, seq=2, x_m=1.5, y_m=-2.5, yaw_rad=0.1, vx_mps=22.2, vy_mps=0.0, yaw_rate_radps=0.0, ax_mps2=0.0, ay_mps2=0.0, sr_angle_rad=0.2,
     ar_position_norm=0.1, br_position_norm=0.0, robots_engaged=True,
 )
+
+
+def test_what_is_too_much_is_dropped_and_counted_and_nobody_waits():
+    gate = threading.Event()
+
+    class Stuck:
+        def put(self, _):
+            gate.wait(10)
+
+    with Publisher(Source.EMULATOR, free_base_port()) as publisher:
+        publisher._publishers = {"world": Stuck()}
+        publisher.post(WORLD)
+        wait_until(lambda: not publisher._queue, 5, "the thread has taken the first sample")
+        for _ in range(256 + 7):
+            publisher.post(WORLD)
+        assert publisher.dropped == 7
+        gate.set()
 
 
 def test_every_source_has_a_port_and_every_topic_a_type():
