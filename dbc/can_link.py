@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 from collections import Counter
+from queue import SimpleQueue
 from types import TracebackType
 from typing import Self
 
@@ -67,7 +68,8 @@ class CanLink:
         self.unsent: Counter[str] = Counter()
         self.refused_polls = 0
         self._is_node = ids is not None
-        self._opening: _Opening | None = None
+        self._opener = _Opener(self._target)
+        self._is_opening = False
         self._monitor = BusMonitor()
         self._confirmation = Confirmation()
         self._recovery, self._reopening = Recovery(), Reopening()
@@ -184,8 +186,7 @@ class CanLink:
 
     def close(self) -> None:
         """Leave the bus."""
-        if self._opening is not None:
-            self._opening.abandon()
+        self._opener.abandon()
         self._port.close()
 
     def __enter__(self) -> Self:
@@ -203,16 +204,17 @@ class CanLink:
         return self._monitor.state in SILENT_STATES or self._has_given_up
 
     def _care(self, now_ns: int) -> None:
-        if self._opening is not None and not self._opening.is_alive():
-            self._take(self._opening.port, now_ns)
-            self._opening = None
+        if self._is_opening and not self._opener.answers.empty():
+            self._take(self._opener.answers.get(), now_ns)
+            self._is_opening = False
         if (controller := self._port.controller()) is not None:
             self._monitor.told(*controller, now_ns)
         state = self._monitor.state
         if self._is_node and self._recovery.is_due(state, self._monitor.bus_offs, now_ns):
             self._port.restart()
-        if self._reopening.is_due(state, now_ns) and self._opening is None:
-            self._opening = _Opening(self._target)
+        if self._reopening.is_due(state, now_ns) and not self._is_opening:
+            self._is_opening = True
+            self._opener.ask()
         self._count_lost()
         self._meter.tick(now_ns)
 
@@ -233,33 +235,42 @@ class CanLink:
         self._monitor.came_up(now_ns)
 
 
-class _Opening(threading.Thread):
-    """Opens a bus again.
+class _Opener(threading.Thread):
+    """Opens a bus again whenever it is asked to. It waits from the set-up on: whoever starts a thread waits until that one runs.
 
     Attributes:
-        port: what was opened, when it is no longer alive; None when it did not open.
+        answers: what was opened, one for each time that it was asked; None when it did not open.
     """
 
     def __init__(self, target: tuple[str, str, frozenset[int] | None]) -> None:
         super().__init__(name="xilgate-bus", daemon=True)
-        self.port: Port | None = None
+        self.answers = SimpleQueue[Port | None]()
         self._target = target
+        self._asked = SimpleQueue[bool]()
         self._lock = threading.Lock()
         self._is_abandoned = False
         self.start()
 
+    def ask(self) -> None:
+        """Have it opened; the answer comes."""
+        self._asked.put(True)
+
     def run(self) -> None:
-        with contextlib.suppress(*OPENING_ERRORS):
-            port = open_port(*self._target)
+        while self._asked.get():
+            port = None
+            with contextlib.suppress(Exception):  # whatever a driver raises, it is tried again
+                port = open_port(*self._target)
             with self._lock:
-                if self._is_abandoned:
+                if self._is_abandoned and port is not None:
                     port.close()
                 else:
-                    self.port = port
+                    self.answers.put(port)
 
     def abandon(self) -> None:
         """Nobody waits for it any more."""
         with self._lock:
             self._is_abandoned = True
-            if self.port is not None:
-                self.port.close()
+            while not self.answers.empty():
+                if (port := self.answers.get()) is not None:
+                    port.close()
+        self._asked.put(False)

@@ -3,6 +3,7 @@
 import errno
 import itertools
 import threading
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -240,6 +241,28 @@ def test_a_bus_that_is_down_is_opened_again_and_gone_on_with(clock, opened):
         wait_until(is_up, 20.0, "the bus to be opened again")
         link.send([frame()])
         assert opened.buses[-1].sent == [SR_COMMAND]
+
+
+@pytest.mark.parametrize("error", [ERRORS["ENODEV"], RuntimeError("of a driver")], ids=repr)
+def test_no_thread_is_started_after_the_set_up_and_none_is_left(clock, opened, monkeypatch, error):
+    before = threading.active_count()
+    with CanLink("fake:0", IDS) as link:
+        monkeypatch.setattr(threading.Thread, "start", lambda _: pytest.fail("a thread was started"))
+        opened.buses[0].errors = dict.fromkeys(["recv", "send"], ERRORS["ENODEV"])
+        opened.failures.append(error)
+        for _ in range(500):
+            clock.tick()
+            link.receive()
+            time.sleep(0.001)
+        opened.failures.clear()
+
+        def is_up():
+            clock.tick(CARE_NS)
+            link.receive()
+            return link.health().state is BusState.ERROR_ACTIVE
+
+        wait_until(is_up, 20.0, "the bus to be opened again")
+    wait_until(lambda: threading.active_count() <= before, 5.0, "the end of the thread")
 
 
 def test_a_link_that_is_closed_while_it_opens_its_bus_again_leaves_none_open(clock, monkeypatch):
