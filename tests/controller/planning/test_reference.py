@@ -66,6 +66,7 @@ def test_a_file_gives_back_the_very_same_numbers(tmp_path_factory, rows):
         (HEADER, "0 rows; a path needs at least 2"),
         (HEADER + "0,0,0,1,1,1\n1,0,0,fast,1,1\n", "row 2, column speed_mps = 'fast': not a number"),
         (HEADER + "0,0,0,1,1,1\n1,0,0\n", "row 2: 3 columns, expected 6"),
+        (HEADER + "0" * 200_000, "field larger than field limit"),
         (HEADER + "0,0,0,1,1,1\n1,0,0,-1,1,1\n", "row 2, column speed_mps = -1: must not be negative"),
     ],
 )
