@@ -256,7 +256,7 @@ class _Opener(threading.Thread):
         self._asked.put(True)
 
     def run(self) -> None:
-        while self._asked.get():
+        while self._asked.get() and not self._is_abandoned:
             port = None
             with contextlib.suppress(Exception):  # whatever a driver raises, it is tried again
                 port = open_port(*self._target)

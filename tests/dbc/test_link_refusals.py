@@ -109,7 +109,10 @@ def opened(monkeypatch):
         return buses[-1]
 
     monkeypatch.setattr("dbc.can_io.can.Bus", open_bus)
-    return SimpleNamespace(buses=buses, failures=failures)
+    yield SimpleNamespace(buses=buses, failures=failures)
+    for thread in threading.enumerate():
+        if thread.name == "xilgate-bus":  # it may be about to open the bus of a link that is closed by now
+            thread.join(5.0)
 
 
 def frame(arbitration_id=SR_COMMAND, t_ns=0):
