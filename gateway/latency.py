@@ -30,23 +30,23 @@ class ValidityClock:
     """Puts times of validity on our clock."""
 
     def __init__(self) -> None:
-        self._newest_ms: int | None = None
-        self._arrival_ns = 0
-        self._offset_ns = 0
+        self._newest: tuple[int, int, int] | None = None
 
     def restart(self) -> None:
         """Learn anew how far the clocks are apart."""
-        self._newest_ms = None
+        self._newest = None
 
     def arrived(self, arrival_ns: int, validity_ms: int) -> int | None:
         """When data that arrive now were valid [ns], at the latest now; None when they are not newer than those before."""
-        offset_ns = arrival_ns - validity_ms * _NS_PER_MS
-        if self._newest_ms is not None:
-            if validity_ms <= self._newest_ms:
+        validity_ns = validity_ms * _NS_PER_MS
+        offset_ns = arrival_ns - validity_ns
+        if self._newest is not None:
+            before_validity_ns, before_arrival_ns, before_offset_ns = self._newest
+            if validity_ns <= before_validity_ns:
                 return None
-            offset_ns = min(offset_ns, self._offset_ns + round((arrival_ns - self._arrival_ns) * MAX_DRIFT))
-        self._newest_ms, self._arrival_ns, self._offset_ns = validity_ms, arrival_ns, offset_ns
-        return validity_ms * _NS_PER_MS + offset_ns
+            offset_ns = min(offset_ns, before_offset_ns + round((arrival_ns - before_arrival_ns) * MAX_DRIFT))
+        self._newest = validity_ns, arrival_ns, offset_ns
+        return validity_ns + offset_ns
 
 
 class LatencyChain:

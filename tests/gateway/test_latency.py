@@ -5,7 +5,7 @@ from itertools import pairwise
 import pytest
 
 from gateway.causes import Cause, Finding
-from gateway.latency import BUCKETS_NS, MAX_AGE_NS, MEASUREMENT_IDS, LatencyChain
+from gateway.latency import BUCKETS_NS, MAX_AGE_NS, MEASUREMENT_IDS, LatencyChain, ValidityClock
 
 MS = 1_000_000
 CYCLE = 40 * MS
@@ -19,6 +19,34 @@ def measured(*ages_ms, chain=None):
         chain.echoed(echo, t_ns + round(age_ms * MS))
         t_ns += CYCLE
     return chain
+
+
+def ages_ms(*data):
+    """Ages on arrival of data that arrive at these times with these times of validity, both in milliseconds."""
+    clock = ValidityClock()
+    valid = [clock.arrived(round(arrival_ms * MS), validity_ms) for arrival_ms, validity_ms in data]
+    return [None if ns is None else arrival_ms - ns / MS for (arrival_ms, _), ns in zip(data, valid, strict=True)]
+
+
+def test_data_are_as_old_as_they_are_later_than_the_soonest():
+    assert ages_ms((5_000, 70), (5_010, 80), (5_023, 90), (5_029, 100), (5_040, 110)) == pytest.approx([0, 0, 3, 0, 1], abs=0.02)
+
+
+def test_a_validity_that_was_there_already_is_not_new():
+    assert ages_ms((5_000, 70), (5_010, 70), (5_020, 69), (5_030, 71)) == [0, None, None, pytest.approx(29, abs=0.02)]
+
+
+def test_clocks_may_drift_apart_slowly():
+    assert ages_ms((0, 0), (100_000, 99_950)) == [0, 0]
+    assert ages_ms((0, 0), (100_000, 99_949)) == [0, pytest.approx(1)]
+    assert ages_ms((0, 0), (50_000, 49_975), (100_000, 99_949)) == [0, 0, pytest.approx(1)]
+
+
+def test_how_far_clocks_are_apart_can_be_learnt_anew():
+    clock = ValidityClock()
+    assert clock.arrived(1_000 * MS, 50) == 1_000 * MS
+    clock.restart()
+    assert clock.arrived(1_500 * MS, 20) == 1_500 * MS
 
 
 def test_ids_count_up_and_come_round():
