@@ -34,13 +34,12 @@ class Cause(Enum):
     WATCHDOG_SILENT = Meaning(7, "robot controller asks no new questions", "ms")
     ROBOT_FAULT = Meaning(10, "robot fault", "")
     ROBOT_MISSES_COMMANDS = Meaning(11, "robot misses commands", "")
-    ROBOTS_NOT_ENGAGED = Meaning(12, "robot controller is not engaged", "")
     TICK_GAP = Meaning(20, "gateway was stopped", "ms")
     MESSAGE_MISSING = Meaning(21, "message is missing", "ms")
     MESSAGE_INVALID = Meaning(22, "message is invalid", "")
     NAVIGATION_FROZEN = Meaning(23, "navigation data frozen", "ms")
     NAVIGATION_COARSE = Meaning(24, "position mode too coarse", "")
-    SPEED_IMPLAUSIBLE = Meaning(25, "speed of wheels and navigation differ", "m/s")
+    SPEED_IMPLAUSIBLE = Meaning(25, "speed contradicts itself or the wheels", "m/s")
     POSITION_IMPLAUSIBLE = Meaning(26, "position and speed contradict each other", "m")
     YAW_RATE_IMPLAUSIBLE = Meaning(27, "yaw rate and heading contradict each other", "rad/s")
     STEERING_IMPLAUSIBLE = Meaning(28, "steering angle moves impossibly fast", "rad/s")
@@ -60,6 +59,7 @@ class Cause(Enum):
     DRIVER_ACCELERATES = Meaning(62, "driver accelerates", "")
     DRIVER_OVERRIDE = Meaning(63, "driver override", "")
     OPERATOR_DISENGAGE = Meaning(64, "operator disengaged", "")
+    ROBOTS_NOT_ENGAGED = Meaning(12, "robot controller is not engaged", "")
 
     @property
     def code(self) -> int:

@@ -13,6 +13,8 @@ STEER_RANGE_RAD = 1.0
 DRIVE_RANGE_NORM = 4.0
 """Ranges of a demand that can be meant; the limits that protect the car are applied later and are far inside."""
 
+FORGIVING_NS = 1_000_000_000
+"""After so long a time without another of them, commands of a second sender are forgotten while nobody is driven."""
 NEVER_NS = 1 << 62
 
 _SECOND_SENDER = "second sender"
@@ -45,6 +47,7 @@ class CommandGate:
         self.bad_in_a_row = 0
         self.strangers = 0
         self.last_cause = ""
+        self._stranger_ns = 0
         self._last: ControlCommand | None = None
         self._admitted_ns: int | None = None
 
@@ -53,6 +56,11 @@ class CommandGate:
         self._last = None
         self.strangers = 0
         self.good_in_a_row = 0
+
+    def forgive(self, now_ns: int) -> None:
+        """Forget a second sender who has not been heard for long."""
+        if now_ns - self._stranger_ns > FORGIVING_NS:
+            self.strangers = 0
 
     def offer(self, now_ns: int, command: ControlCommand, state_seq: int) -> bool:
         """Take a command in, or count why not.
@@ -67,7 +75,9 @@ class CommandGate:
             self.rejected[cause] += 1
             self.last_cause = cause
             self.bad_in_a_row += 1
-            self.strangers += cause == _SECOND_SENDER
+            if cause == _SECOND_SENDER:
+                self.strangers += 1
+                self._stranger_ns = now_ns
             self.good_in_a_row = 0
             return False
         self.bad_in_a_row = 0

@@ -207,6 +207,7 @@ class GatewayCore:
 
     def _admit(self, now_ns: int, command: ControlCommand | None) -> None:
         if self.mode in QUIET:
+            self.commands.forgive(now_ns)
             self._validity.restart()  # a lag is judged from READY on: until then other data may come, or a system that has begun anew
         if self.mode in QUIET and self.commands.age_ns(now_ns) > COMMAND_TIMEOUT_NS:
             self.commands.release()  # a controller that has gone may come back as another process

@@ -22,6 +22,9 @@ BUCKETS_NS = tuple(ms * 1_000_000 for ms in (10, 20, 30, 40, 50, 60, 80, 100, 12
 MAX_DRIFT = 500e-6
 """Rate at which the two clocks may drift apart: the fastest that the kernel lets a clock be corrected; crystals are ten times better."""
 
+MAX_AHEAD_NS = 20_000_000
+"""Data that are younger by more than any before [ns] have to be followed by others that are: the message has no checksum."""
+
 _MS_PER_NS = 1e-6
 _NS_PER_MS = 1_000_000
 
@@ -31,20 +34,25 @@ class ValidityClock:
 
     def __init__(self) -> None:
         self._newest: tuple[int, int, int] | None = None
+        self._is_ahead = False
 
     def restart(self) -> None:
         """Learn anew how far the clocks are apart."""
         self._newest = None
 
     def arrived(self, arrival_ns: int, validity_ms: int) -> int | None:
-        """When data that arrive now were valid [ns], at the latest now; None when they are not newer than those before."""
+        """When data that arrive now were valid [ns], at the latest now; None when they are not newer than those before, or cannot be."""
         validity_ns = validity_ms * _NS_PER_MS
         offset_ns = arrival_ns - validity_ns
         if self._newest is not None:
             before_validity_ns, before_arrival_ns, before_offset_ns = self._newest
             if validity_ns <= before_validity_ns:
                 return None
-            offset_ns = min(offset_ns, before_offset_ns + round((arrival_ns - before_arrival_ns) * MAX_DRIFT))
+            largest_ns = before_offset_ns + round((arrival_ns - before_arrival_ns) * MAX_DRIFT)
+            was_ahead, self._is_ahead = self._is_ahead, offset_ns < largest_ns - MAX_AHEAD_NS
+            if self._is_ahead and not was_ahead:
+                return None
+            offset_ns = min(offset_ns, largest_ns)
         self._newest = validity_ns, arrival_ns, offset_ns
         return validity_ns + offset_ns
 

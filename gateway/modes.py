@@ -25,7 +25,6 @@ class Trigger(Enum):
 
     GIVE_UP = "the robots cannot be relied on"
     HAND_OVER = "driver or operator takes over"
-    LOOSE = "the robots have let go"
     STOP = "stop"
     STOP_GENTLY = "gentle stop"
     RESET = "operator reset"
@@ -44,7 +43,6 @@ REACTIONS: Mapping[Cause, Trigger] = {
     Cause.WATCHDOG_SILENT: Trigger.STOP,
     Cause.ROBOT_FAULT: Trigger.STOP,
     Cause.ROBOT_MISSES_COMMANDS: Trigger.STOP,
-    Cause.ROBOTS_NOT_ENGAGED: Trigger.LOOSE,
     Cause.TICK_GAP: Trigger.STOP,
     Cause.MESSAGE_MISSING: Trigger.STOP,
     Cause.MESSAGE_INVALID: Trigger.STOP,
@@ -70,6 +68,7 @@ REACTIONS: Mapping[Cause, Trigger] = {
     Cause.DRIVER_ACCELERATES: Trigger.HAND_OVER,
     Cause.DRIVER_OVERRIDE: Trigger.HAND_OVER,
     Cause.OPERATOR_DISENGAGE: Trigger.HAND_OVER,
+    Cause.ROBOTS_NOT_ENGAGED: Trigger.HAND_OVER,  # disarmed, or they would engage later by themselves, when nobody expects it
 }
 """What each cause asks for."""
 
@@ -84,17 +83,14 @@ TRANSITIONS: Mapping[tuple[Mode, Trigger], Mode] = {
     (Mode.READY, Trigger.BLOCKED): Mode.STANDBY,
     (Mode.READY, Trigger.ENGAGE): Mode.ENGAGED,
     (Mode.ENGAGED, Trigger.GIVE_UP): Mode.FAULT,
-    (Mode.ENGAGED, Trigger.LOOSE): Mode.FAULT,  # on no account engage later by themselves, when nobody expects it
     (Mode.ENGAGED, Trigger.STOP): Mode.SAFE_STOP,
     (Mode.ENGAGED, Trigger.STOP_GENTLY): Mode.COMFORT_STOP,
     (Mode.ENGAGED, Trigger.HAND_OVER): Mode.STANDBY,
     (Mode.COMFORT_STOP, Trigger.GIVE_UP): Mode.FAULT,
-    (Mode.COMFORT_STOP, Trigger.LOOSE): Mode.FAULT,
     (Mode.COMFORT_STOP, Trigger.STOP): Mode.SAFE_STOP,
     (Mode.COMFORT_STOP, Trigger.HAND_OVER): Mode.STANDBY,
     (Mode.COMFORT_STOP, Trigger.RESET): Mode.STANDBY,
     (Mode.SAFE_STOP, Trigger.GIVE_UP): Mode.FAULT,
-    (Mode.SAFE_STOP, Trigger.LOOSE): Mode.FAULT,
     (Mode.SAFE_STOP, Trigger.HAND_OVER): Mode.STANDBY,
     (Mode.SAFE_STOP, Trigger.RESET): Mode.STANDBY,
     (Mode.FAULT, Trigger.RESET): Mode.STANDBY,

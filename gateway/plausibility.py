@@ -17,6 +17,12 @@ SPEED_LIMIT_MPS = 2.0
 """Difference of the speeds of wheels and navigation, as in opendbc. In undisturbed drives 0.8 m/s."""
 SPEED_HOLD_NS = 100_000_000
 """Wheels that slip for a moment are no fault of a sensor."""
+BRAKE_SLIP = 0.3
+"""By this share of the car's speed wheels may be slower while an anti-lock brake works: it keeps the slip below a quarter."""
+SLOWING_MPS = 0.05
+"""Loss of speed in the window below that excuses such wheels: ice gives twice as much, and a speed that is frozen none."""
+SPEED_JUMP_MPS = 2.5
+"""Change of speed in the window below that no car makes: at 1 g, and with frames lost, it is 1.9 m/s."""
 
 MOTION_WINDOW_MS = 100
 """Over this time position and heading are held against speed and yaw rate: ten measurements of the navigation system."""
@@ -74,16 +80,16 @@ class _Motion:
     """Position and heading against what speed and yaw rate make of them, over the last `MOTION_WINDOW_MS` of navigation time."""
 
     def __init__(self) -> None:
-        self._before: tuple[int, float, float, float] | None = None
-        self._steps: deque[tuple[int, float, float, float]] = deque()
+        self._before: tuple[int, float, float, float, float] | None = None
+        self._steps: deque[tuple[int, float, float, float, float]] = deque()
 
     def update(self, m: Measurement) -> None:
         """Take in a measurement; nothing is new without a new time of validity."""
-        now = (m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad)
+        now = (m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad, m.vx_mps)
         before = now if self._before is None else self._before
         elapsed_ms = m.navigation_time_ms - before[0]
         if elapsed_ms in range(1, MOTION_WINDOW_MS + 1):
-            self._steps.append(_unexplained(before, m, elapsed_ms * 1e-3))
+            self._steps.append(_step(before, m, elapsed_ms * 1e-3))
             while m.navigation_time_ms - self._steps[0][0] >= MOTION_WINDOW_MS:
                 self._steps.popleft()
         elif elapsed_ms:
@@ -93,23 +99,29 @@ class _Motion:
     @property
     def position_error_m(self) -> float:
         """How far the position has moved otherwise than the speed says."""
-        return math.hypot(sum(x_m for _, x_m, _, _ in self._steps), sum(y_m for _, _, y_m, _ in self._steps))
+        return math.hypot(sum(x_m for _, x_m, *_ in self._steps), sum(y_m for _, _, y_m, *_ in self._steps))
 
     @property
     def yaw_rate_error_radps(self) -> float:
         """How much faster the heading has turned than the yaw rate says, mean over the window."""
-        return sum(yaw_rad for *_, yaw_rad in self._steps) / (MOTION_WINDOW_MS * 1e-3)
+        return sum(yaw_rad for *_, yaw_rad, _ in self._steps) / (MOTION_WINDOW_MS * 1e-3)
+
+    @property
+    def speed_change_mps(self) -> float:
+        """By how much the car has become faster."""
+        return sum(vx_mps for *_, vx_mps in self._steps)
 
 
-def _unexplained(before: tuple[int, float, float, float], m: Measurement, elapsed_s: float) -> tuple[int, float, float, float]:
-    """Time, and what of the step in x, y and heading is not explained by speed and yaw rate."""
-    _, x_m, y_m, yaw_rad = before
+def _step(before: tuple[int, float, float, float, float], m: Measurement, elapsed_s: float) -> tuple[int, float, float, float, float]:
+    """Time; what of the step in x, y and heading is not explained by speed and yaw rate; and the step of the speed."""
+    _, x_m, y_m, yaw_rad, vx_mps = before
     cosine, sine = math.cos(m.yaw_rad), math.sin(m.yaw_rad)
     return (
         m.navigation_time_ms,
         m.x_m - x_m - (m.vx_mps * cosine - m.vy_mps * sine) * elapsed_s,
         m.y_m - y_m - (m.vx_mps * sine + m.vy_mps * cosine) * elapsed_s,
         math.remainder(m.yaw_rad - yaw_rad, math.tau) - m.yaw_rate_radps * elapsed_s,
+        m.vx_mps - vx_mps,
     )
 
 
@@ -130,7 +142,7 @@ class Plausibility:
         self._steered: tuple[int, float] | None = None
         self._demands_rad: deque[tuple[int, float]] = deque()
         self._pedal_demands: deque[tuple[int, float, float]] = deque()
-        self._speed = _Held(SPEED_HOLD_NS)
+        self._speed, self._jump = _Held(SPEED_HOLD_NS), _Held(MOTION_HOLD_NS)
         self._position, self._yaw_rate = _Held(MOTION_HOLD_NS), _Held(MOTION_HOLD_NS)
         self._following = _Held(FOLLOWING_HOLD_NS)
         self._brake, self._accelerator = _Held(PEDAL_HOLD_NS), _Held(PEDAL_HOLD_NS)
@@ -164,15 +176,23 @@ class Plausibility:
         wheels_mps = m.vx_mps if self._is_on_lift else median(m.wheel_speed_radps) * self._wheel_radius_m
         position_limit_m = clamp(0.5 * abs(m.vx_mps) * MOTION_WINDOW_MS * 1e-3, *POSITION_LIMITS_M)
         checks = (
-            (self._speed, Cause.SPEED_IMPLAUSIBLE, wheels_mps - m.vx_mps, SPEED_LIMIT_MPS),
-            (self._position, Cause.POSITION_IMPLAUSIBLE, self._motion.position_error_m, position_limit_m),
-            (self._yaw_rate, Cause.YAW_RATE_IMPLAUSIBLE, self._motion.yaw_rate_error_radps, YAW_RATE_LIMIT_RADPS),
+            (self._speed, Cause.SPEED_IMPLAUSIBLE, "wheels", wheels_mps - m.vx_mps, self._speed_limit_mps(m, wheels_mps)),
+            (self._jump, Cause.SPEED_IMPLAUSIBLE, "navigation", self._motion.speed_change_mps, SPEED_JUMP_MPS),
+            (self._position, Cause.POSITION_IMPLAUSIBLE, "navigation", self._motion.position_error_m, position_limit_m),
+            (self._yaw_rate, Cause.YAW_RATE_IMPLAUSIBLE, "navigation", self._motion.yaw_rate_error_radps, YAW_RATE_LIMIT_RADPS),
         )
         return [
-            Finding(cause, abs(error), limit, "navigation")
-            for held, cause, error, limit in checks
+            Finding(cause, abs(error), limit, source)
+            for held, cause, source, error, limit in checks
             if held.update(now_ns, abs(error) > limit)
         ]
+
+    def _speed_limit_mps(self, m: Measurement, wheels_mps: float) -> float:
+        """How far wheels and navigation may be apart: further when brakes hold the wheels of a car that slows down."""
+        is_braking = max(m.brake_norm, m.brake_pedal_norm) > PEDAL_LIMIT_NORM and wheels_mps < m.vx_mps
+        if is_braking and self._motion.speed_change_mps < -SLOWING_MPS:
+            return max(SPEED_LIMIT_MPS, BRAKE_SLIP * m.vx_mps)
+        return SPEED_LIMIT_MPS
 
     def _judge_steering_rate(self, now_ns: int, m: Measurement) -> list[Finding]:
         before_ns, before_rad = (now_ns, m.steering_wheel_rad) if self._steered is None else self._steered

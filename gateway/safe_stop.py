@@ -10,6 +10,8 @@ from gateway.limits import StopGrade
 from gateway.messages import HORIZON_STEPS, PLAN_PERIOD_NS, ControlCommand
 
 STANDSTILL_MPS = 0.1
+ROLLING_MPS = 0.5
+"""A car that stands may be measured as fast as this."""
 SLOWING_SHARE = 0.5
 """Part of what a stop asks for that must have become of the speed: a slope takes 1 m/s2 at 10 %, as much as a gentle stop gives."""
 SLOWING_MARGIN_MPS = 2.0
@@ -68,11 +70,13 @@ class SafeStop:
 
     def allowed_mps(self, now_ns: int) -> float:
         """The largest speed at `now_ns` of a car that slows down [m/s]: a steep slope may be stronger than the brake of a gentle stop."""
-        elapsed_s, initial_mps2 = (now_ns - self._start_ns) * 1e-9, self._initial_deceleration_mps2
-        more_mps2 = max(self._grade.deceleration_mps2 - initial_mps2, 0.0)
+        elapsed_s = (now_ns - self._start_ns) * 1e-9
+        # One that brakes harder already is asked for no more than the stop is: the road may not give it.
+        initial_mps2 = min(self._initial_deceleration_mps2, self._grade.deceleration_mps2)
+        more_mps2 = self._grade.deceleration_mps2 - initial_mps2
         growing_s = min(elapsed_s, more_mps2 / self._grade.jerk_mps3)
         asked_mps = initial_mps2 * elapsed_s + 0.5 * self._grade.jerk_mps3 * growing_s**2 + more_mps2 * (elapsed_s - growing_s)
-        return max(self._speed_mps + SLOWING_MARGIN_MPS - SLOWING_SHARE * asked_mps, STANDSTILL_MPS)
+        return max(self._speed_mps + SLOWING_MARGIN_MPS - SLOWING_SHARE * asked_mps, ROLLING_MPS)
 
     def demand(self, now_ns: int, vx_mps: float) -> StopDemand:
         """Demand at `now_ns` for a car at speed `vx_mps`; standing is latched."""

@@ -8,7 +8,7 @@ is invalid until it has been good for a while, even though enough good ones come
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
 
-from dbc.catalogue import Catalogue, DecodeError, MessageSpec
+from dbc.catalogue import NETWORKS, Catalogue, DecodeError, MessageSpec
 from dbc.e2e import E2EReceiver, E2EState, E2EWindow, WindowRules
 from dbc.frame import CanFrame
 from gateway.causes import Cause, Finding
@@ -22,7 +22,7 @@ RECOVERY_NS = 1_000_000_000
 FLOW_WINDOW_NS = 130_000_000
 """Time over which losses are counted [ns]: with 20 % lost the reaction is to come within 150 ms."""
 MAX_LOST_FRAMES = 5
-"""Frames lost in that time that are only counted, of about 160: with 1 % lost there are 2, with 20 % there are 31."""
+"""Frames of a bus lost in that time that are only counted, of about 80: with 1 % lost there is 1, with 20 % there are 16."""
 MAX_FLOW_CYCLE_NS = 10_000_000
 MAX_LULL_NS = 10_000_000
 """Time without any frame that is usual [ns]: of messages with this cycle time that all come at once."""
@@ -73,42 +73,47 @@ class MessageWatch:
 
 
 class Flow:
-    """How many of the frames that should come do come: losses that no single message shows, because each is soon followed by a good frame.
+    """How many of a bus's frames that should come do come: losses that no single message shows, because a good frame follows soon.
+
+    A message that comes more often than it should makes up for no other.
 
     Args:
         specs: the messages to count; those slower than `MAX_FLOW_CYCLE_NS` would say something too late.
     """
 
-    def __init__(self, specs: Iterable[MessageSpec]) -> None:
-        cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if spec.cycle_time_ns and spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS}
-        self._names = frozenset(cycles_ns)
-        self._frames_per_ns = sum(1.0 / cycle_ns for cycle_ns in cycles_ns.values())
-        self._jitter_frames = len(cycles_ns)  # one of each message may just be on its way
-        self._good = 0
+    def __init__(self, network: str, specs: Iterable[MessageSpec]) -> None:
+        self._network = network
+        self._cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS}
+        self._limit = len(self._cycles_ns) + MAX_LOST_FRAMES  # one of each message may just be on its way
+        self._good: Counter[str] = Counter()
         self._paused_ns = 0
         self._last_ns = 0
-        self._before: tuple[int, int, int] | None = None
-        self._within: deque[tuple[int, int, int]] = deque()
+        self._before: tuple[int, int, tuple[int, ...]] | None = None
+        self._within: deque[tuple[int, int, tuple[int, ...]]] = deque()
 
     def note_good(self, spec: MessageSpec, t_ns: int) -> None:
         """Count a good frame that arrived at `t_ns`."""
-        self._good += spec.name in self._names
+        self._good[spec.name] += 1
         self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
-        self._last_ns = max(t_ns, self._last_ns)  # of two buses, one is read after the other
+        self._last_ns = max(t_ns, self._last_ns)
 
     def finding(self, now_ns: int) -> Finding | None:
         """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
         paused_ns = self._paused_ns + max(now_ns - self._last_ns - MAX_LULL_NS, 0)
-        self._within.append((now_ns, paused_ns, self._good))
+        good = tuple(self._good[name] for name in self._cycles_ns)
+        self._within.append((now_ns, paused_ns, good))
         while self._within[0][0] <= now_ns - FLOW_WINDOW_NS:
             self._before = self._within.popleft()
         if self._before is None:
             return None
         then_ns, paused_then_ns, good_then = self._before
-        expected = (now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)) * self._frames_per_ns
-        lost = expected - (self._good - good_then)
-        limit = self._jitter_frames + MAX_LOST_FRAMES
-        return Finding(Cause.FRAMES_LOST, 100.0 * lost / expected, 100.0 * limit / expected, "buses") if lost > limit else None
+        elapsed_ns = now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)
+        expected = [elapsed_ns / cycle_ns for cycle_ns in self._cycles_ns.values()]
+        lost = sum(max(due + before - now, 0.0) for due, before, now in zip(expected, good_then, good, strict=True))
+        if lost <= self._limit:
+            return None
+        percent = 100.0 / sum(expected)
+        return Finding(Cause.FRAMES_LOST, percent * lost, percent * self._limit, self._network)
 
 
 class Supervisor:
@@ -128,7 +133,8 @@ class Supervisor:
         self._watches = {catalogue.by_name[name].arbitration_id: MessageWatch(catalogue.by_name[name]) for name in needed}
         self._by_name = {watch.spec.name: watch for watch in self._watches.values()}
         self._own = {arbitration_id: spec for arbitration_id, spec in catalogue.by_id.items() if spec.sender == node}
-        self._flow = Flow(watch.spec for watch in self._watches.values())
+        specs = [watch.spec for watch in self._watches.values()]
+        self._flows = {network: Flow(network, [spec for spec in specs if spec.network == network]) for network in NETWORKS}
         self._impostor: Finding | None = None
         self.received = 0
         self.rejected: Counter[str] = Counter()
@@ -150,7 +156,7 @@ class Supervisor:
                     cause = "range"
             watch.note(frame.t_ns, cause is None)
             if cause is None:
-                self._flow.note_good(watch.spec, frame.t_ns)
+                self._flows[watch.spec.network].note_good(watch.spec, frame.t_ns)
             else:
                 self.rejected[f"{watch.spec.name}: {cause}"] += 1
         return values
@@ -170,5 +176,6 @@ class Supervisor:
     def findings(self, now_ns: int) -> list[Finding]:
         """What is wrong with the messages now, and, once, that somebody else has sent ours."""
         impostor, self._impostor = self._impostor, None
-        candidates = [impostor, self._flow.finding(now_ns), *(watch.finding(now_ns) for watch in self._watches.values())]
+        flows = [flow.finding(now_ns) for flow in self._flows.values()]
+        candidates = [impostor, *flows, *(watch.finding(now_ns) for watch in self._watches.values())]
         return [finding for finding in candidates if finding is not None]

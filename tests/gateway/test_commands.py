@@ -122,6 +122,17 @@ def test_a_sender_who_has_gone_leaves_what_he_said_and_no_readiness_for_the_next
     assert gate.good_in_a_row == 1
 
 
+def test_a_second_sender_is_forgotten_a_second_after_his_last_command():
+    gate, second_ns = gate_with_one(), 1_000_000_000
+    gate.offer(NOW_NS, replace(COMMAND, boot_id=8), STATE_SEQ)
+    gate.offer(NOW_NS + second_ns, replace(COMMAND, boot_id=8), STATE_SEQ)
+    gate.offer(NOW_NS + second_ns + 9, replace(COMMAND, seq=1), STATE_SEQ)  # old, but of the first
+    gate.forgive(NOW_NS + 2 * second_ns)
+    assert gate.strangers == 2
+    gate.forgive(NOW_NS + 2 * second_ns + 1)
+    assert gate.strangers == 0
+
+
 def test_another_sender_may_begin_with_any_number_after_a_reset():
     gate = gate_with_one()
     gate.reset()

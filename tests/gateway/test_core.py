@@ -17,7 +17,6 @@ from dbc.health import LinkHealth
 from dbc.vehicle import load_vehicle
 from dbc.watchdog import answer
 from gateway.causes import Cause, Finding
-from gateway.codec import MONITOR_MESSAGES
 from gateway.conditions import Surroundings
 from gateway.core import ENGAGE_GRACE_NS, TICK_NS, GatewayCore
 from gateway.limits import BENCH, LIFTED, NOMINAL, PROVING_GROUND
@@ -222,7 +221,7 @@ def test_safe_stop_follows_the_tail_of_the_plan():
         (lambda d: setattr(d.car, "position_mode", "Blanked"), Cause.NAVIGATION_COARSE, Mode.SAFE_STOP),
         (lambda d: setattr(d.car, "fault", 1), Cause.ROBOT_FAULT, Mode.SAFE_STOP),
         (lambda d: setattr(d.car, "command_timeout", 1), Cause.ROBOT_MISSES_COMMANDS, Mode.SAFE_STOP),
-        (lambda d: setattr(d.car, "system_state", "Armed"), Cause.ROBOTS_NOT_ENGAGED, Mode.FAULT),
+        (lambda d: setattr(d.car, "system_state", "Armed"), Cause.ROBOTS_NOT_ENGAGED, Mode.STANDBY),
         (lambda d: setattr(d.car, "system_state", "EStop"), Cause.ROBOTS_EMERGENCY_STOP, Mode.FAULT),
         (lambda d: setattr(d, "status", CommandStatus.FAILED), Cause.COMMAND_FAILED, Mode.SAFE_STOP),
         (lambda d: setattr(d, "command_boot_id", 8), Cause.COMMAND_LOST, Mode.SAFE_STOP),
@@ -648,10 +647,33 @@ def test_robots_that_have_not_followed_are_not_asked_any_more():
     drive = GatewayDrive()
     drive.car.system_state = "Armed"
     drive.engage().tick(25)
-    assert drive.core.mode is Mode.FAULT
+    assert drive.core.mode is Mode.STANDBY
+    requests = drive.catalogue.enumeration("GW_SafetyCommand", "SystemRequest")
     for _ in range(100):
-        names = {drive.catalogue.by_id[frame.arbitration_id].name for frame in drive.tick().output.frames}
-        assert names <= set(MONITOR_MESSAGES)
+        drive.tick()
+        assert drive.car.told["GW_SafetyCommand"]["SystemRequest"] == requests["Disarm"]
+        assert drive.car.told["SR_Command"]["Enable"] == 0
+
+
+@pytest.mark.req("S2")
+def test_a_second_controller_that_has_gone_does_not_keep_from_arming():
+    drive = GatewayDrive().tick(250)
+    for _ in range(3):
+        drive.now_ns += TICK_NS
+        drive.core.step(drive.now_ns, drive.car.speak(drive.now_ns), replace(drive.command(), boot_id=8))
+    assert any("second controller" in blocker for blocker in drive.core.blockers)
+    drive.tick(250)
+    assert drive.core.blockers == []
+
+
+@pytest.mark.req("S2")
+def test_while_a_car_may_be_driven_a_second_controller_is_remembered():
+    drive = engaged()
+    for _ in range(2):
+        drive.now_ns += TICK_NS
+        drive.core.step(drive.now_ns, drive.car.speak(drive.now_ns), replace(drive.command(), boot_id=8))
+    drive.tick(250)
+    assert (drive.core.mode, drive.core.commands.strangers) == (Mode.ENGAGED, 2)
 
 
 @pytest.mark.req("E3")

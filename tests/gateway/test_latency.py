@@ -42,6 +42,21 @@ def test_clocks_may_drift_apart_slowly():
     assert ages_ms((0, 0), (50_000, 49_975), (100_000, 99_949)) == [0, 0, pytest.approx(1)]
 
 
+@pytest.mark.parametrize("ahead_ms", [21, 70, 10_000])
+def test_one_time_far_ahead_is_none_and_two_are_another_clock(ahead_ms):
+    assert ages_ms((1_000, 0), (1_010, 10 + ahead_ms), (1_020, 20)) == [0, None, pytest.approx(0, abs=0.03)]
+    steady = [(1_000, 0), (1_010, 10)]
+    assert ages_ms(*steady, (1_020, 20 + ahead_ms), (1_030, 30), (1_040, 40 + ahead_ms), (1_050, 50)) == (
+        pytest.approx([0, 0, None, 0, None, 0], abs=0.03)
+    )
+    ahead = [(1_020, 20 + ahead_ms), (1_030, 30 + ahead_ms), (1_040, 40 + ahead_ms), (1_050, 50 + ahead_ms - 5)]
+    assert ages_ms(*steady, *ahead) == pytest.approx([0, 0, None, 0, 0, 5], abs=0.03)
+
+
+def test_data_that_come_a_little_sooner_than_ever_are_taken_at_once():
+    assert ages_ms((1_000, 0), (1_010, 29), (1_020, 39), (1_030, 44)) == pytest.approx([0, 0, 0, 5], abs=0.03)
+
+
 def test_how_far_clocks_are_apart_can_be_learnt_anew():
     clock = ValidityClock()
     assert clock.arrived(1_000 * MS, 50) == 1_000 * MS

@@ -100,7 +100,39 @@ def shift(name, amount):
 NAVIGATION = ("x_m", "y_m", "yaw_rad", "vx_mps", "vy_mps", "yaw_rate_radps")
 
 
+def braking(drive, deceleration_mps2, slip, *, is_pressed=True, is_frozen=False):
+    """What is measured while the wheels of a car that slows down are slower than it is."""
+    frozen_mps = drive.speed_mps
+
+    def lie(m):
+        drive.speed_mps = max(drive.speed_mps - 0.01 * deceleration_mps2, 0.0)
+        m.wheel_speed_radps = ((1.0 - slip) * m.vx_mps / RADIUS_M,) * 4
+        m.brake_pedal_norm = 1.0 if is_pressed else 0.0
+        m.vx_mps = frozen_mps if is_frozen else m.vx_mps
+
+    return lie
+
+
 # ---- honest signals
+
+
+@pytest.mark.parametrize(("deceleration_mps2", "slip"), [(10.0, 0.12), (9.0, 0.25), (3.0, 0.25), (1.0, 0.29)])
+def test_an_anti_lock_brake_is_no_fault_of_a_sensor(deceleration_mps2, slip):
+    drive = Drive(34.0, is_driving=False, turn_radps=0.0).step(50)
+    drive.lie = braking(drive, deceleration_mps2, slip)
+    assert not drive.step(300).found
+
+
+def test_a_robot_that_brakes_excuses_slip_as_a_foot_does():
+    drive = Drive(34.0, is_driving=False, turn_radps=0.0).step(50)
+    pressed = braking(drive, 9.0, 0.2, is_pressed=False)
+
+    def lie(m):
+        pressed(m)
+        m.brake_norm = 0.06
+
+    drive.lie = lie
+    assert not drive.step(300).found
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 0.3, 2.0, 15.0, 36.0, -2.0])
@@ -178,6 +210,50 @@ def test_a_time_may_come_before_its_position(speed_mps):
 # ---- speed
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"slip": 0.31},  # more than an anti-lock brake lets happen
+        {"is_pressed": False},
+        {"deceleration_mps2": 0.4},  # on no road are brakes as weak as that
+    ],
+)
+def test_slip_has_to_be_that_of_brakes(changes):
+    drive = Drive(34.0, is_driving=False, turn_radps=0.0).step(50)
+    drive.lie = braking(drive, **{"deceleration_mps2": 5.0, "slip": 0.2} | changes)
+    drive.step(300)
+    assert drive.causes == [Cause.SPEED_IMPLAUSIBLE]
+    assert drive.found[0].limit == pytest.approx(max(2.0, 0.3 * drive.speed_mps) if "slip" in changes else 2.0, rel=0.05)
+
+
+def test_brakes_make_no_wheel_faster():
+    drive = Drive(34.0, is_driving=False, turn_radps=0.0).step(50)
+    drive.lie = braking(drive, 5.0, -0.2)
+    assert drive.until_found() == 100 * MS
+    assert drive.causes == [Cause.SPEED_IMPLAUSIBLE]
+
+
+def test_a_speed_that_is_frozen_is_no_slip():
+    drive = Drive(20.0, is_driving=False, turn_radps=0.0).step(50)
+    drive.lie = braking(drive, 8.0, 0.0, is_frozen=True)
+    assert drive.until_found() <= 360 * MS  # after 250 ms the difference is 2 m/s
+    assert drive.causes == [Cause.SPEED_IMPLAUSIBLE]
+
+
+@pytest.mark.parametrize(("jump_mps", "is_found"), [(2.51, True), (-2.51, True), (2.49, False), (-2.49, False)])
+def test_no_car_changes_its_speed_at_once(jump_mps, is_found):
+    """The wheels jump with it."""
+    drive = Drive().step(50)
+    both = shift("vx_mps", jump_mps), shift("wheel_speed_radps", jump_mps / RADIUS_M)
+    drive.lie = lambda m: [lie(m) for lie in both]
+    drive.step(20)
+    if is_found:
+        assert drive.found == [Finding(Cause.SPEED_IMPLAUSIBLE, pytest.approx(2.51), 2.5, "navigation")]
+        assert drive.tick == 50 + 4
+    else:
+        assert not drive.found
+
+
 @pytest.mark.parametrize("speed_mps", [0.0, 15.0, 36.0, -3.0])
 @pytest.mark.parametrize(("wrong_mps", "is_found"), [(2.001, True), (-2.001, True), (1.999, False), (-1.999, False)])
 def test_speeds_of_wheels_and_navigation(speed_mps, wrong_mps, is_found):
@@ -189,7 +265,7 @@ def test_speeds_of_wheels_and_navigation(speed_mps, wrong_mps, is_found):
     assert drive.causes == ([Cause.SPEED_IMPLAUSIBLE] if is_found else [])
     if is_found:
         assert drive.tick == 41  # the eleventh: 100 ms
-        assert drive.found == [Finding(Cause.SPEED_IMPLAUSIBLE, pytest.approx(2.001), 2.0, "navigation")]
+        assert drive.found == [Finding(Cause.SPEED_IMPLAUSIBLE, pytest.approx(2.001), 2.0, "wheels")]
 
 
 def test_a_speed_of_the_navigation_system_that_is_off():

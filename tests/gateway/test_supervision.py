@@ -146,12 +146,13 @@ def test_three_bad_frames_count_together_when_ten_frames_hold_them(last, is_inva
 def test_a_message_without_a_cycle_is_neither_expected_nor_counted_among_those_that_are():
     specs = [CATALOGUE.by_name[name] for name in FAST]
     event = replace(STATUS, name="Event", cycle_time_ns=0)
-    flow = Flow([*specs, event])
+    flow = Flow("bus", [*specs, event])
     for k in range(20):
         for _ in range(100):
             flow.note_good(event, k * 10 * MS)
         found = flow.finding(k * 10 * MS)
-    assert found == Finding(Cause.FRAMES_LOST, 100.0, pytest.approx(100 * (len(FAST) + MAX_LOST_FRAMES) / (13 * len(FAST))), "buses")
+    limit = pytest.approx(100 * (len(FAST) + MAX_LOST_FRAMES) / (13 * len(FAST)))
+    assert found == Finding(Cause.FRAMES_LOST, pytest.approx(100.0), limit, "bus")
 
 
 @pytest.mark.req("F11")
@@ -191,19 +192,33 @@ class Traffic:
         return causes_found
 
 
-FAST = ("SR_Status", "AR_Status", "BR_Status", "RC_SafetyStatus", "PosLocal", "VelocityLevel", "VelYawLocal", "RateVehicle", "MilliTime")
+FAST = ("PosLocal", "VelocityLevel", "AccelLevel", "VelYawLocal", "RateVehicle", "MilliTime")
+ROBOTS = ("SR_Status", "AR_Status", "BR_Status", "RC_SafetyStatus", "CAR_WheelSpeeds", "CAR_Powertrain")
 
 
 @pytest.mark.req("F9")
 def test_losses_that_no_message_shows_by_itself_are_found_in_the_sum():
     for seed in range(50):
         dice = random.Random(seed)
-        traffic = Traffic(*FAST)
-        assert traffic.run(100, lambda _: True) == []
-        lossy = traffic.run(15, lambda _, dice=dice: dice.random() >= 0.25)
-        assert lossy
-        assert lossy[0].source == "buses"
-        assert lossy[0].value > lossy[0].limit
+        for names, source in ((FAST, "navigation"), (ROBOTS, "robots")):
+            traffic = Traffic(*FAST, *ROBOTS)
+            lossy_ids = {CATALOGUE.by_name[name].arbitration_id for name in names}
+            is_lossy = [sender.spec.arbitration_id in lossy_ids for sender in traffic.senders]
+            assert traffic.run(100, lambda _: True) == []
+            lossy = traffic.run(15, lambda k, is_lossy=is_lossy, dice=dice: not is_lossy[k] or dice.random() >= 0.3)
+            assert lossy
+            assert lossy[0].source == source
+            assert lossy[0].value > lossy[0].limit
+
+
+@pytest.mark.req("F9")
+def test_what_comes_too_often_makes_up_for_nothing_else():
+    traffic = Traffic(*FAST)
+    traffic.senders += [Sender(name) for name in FAST[2:]] * 3
+    assert traffic.run(20, lambda _: True) == []
+    found = [finding for tick in range(14) for finding in traffic.run(1, lambda k, tick=tick: k > 1 or tick % 3 == 0)]
+    assert found
+    assert found[0].source == "navigation"
 
 
 @pytest.mark.req("F9")

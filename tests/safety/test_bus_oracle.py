@@ -23,6 +23,7 @@ class Script:
         self.now_ns = 1_000 * MS
         self.speed_mps = 20.0
         self.wheels_mps = 0.0
+        self.system_state = "Engaged"
         self.angle_deg = self.drive_percent = self.brake_percent = 0.0
         self.request, self.is_following, self.is_enabled = "Disarm", False, False
         self.age_ms = 20.0
@@ -56,7 +57,7 @@ class Script:
             self.car("VelocityLevel", {"VelForward": self.speed_mps})
             wheel_radps = self.wheels_mps / 0.31
             self.car("CAR_WheelSpeeds", dict.fromkeys(("FrontLeft", "FrontRight", "RearLeft", "RearRight"), wheel_radps))
-            self.car("RC_SafetyStatus", {"WatchdogQuestion": self.question})
+            self.car("RC_SafetyStatus", {"WatchdogQuestion": self.question, "SystemState": self.system_state})
             for _ in range(self.repeats):
                 self.speak()
         return self
@@ -259,6 +260,13 @@ def _ramp(name, step, ticks, **changes):
         return script
 
     return break_it
+
+
+def test_robots_that_do_not_follow_are_not_abandoned():
+    script = Script().engage()
+    script.system_state = "Armed"
+    script.tick(20)
+    assert script.go("Disarm").tick(20).rules == set()
 
 
 @pytest.mark.parametrize(("profile", "rules"), [("nominal", {"lateral jerk", "lateral acceleration"}), ("bench", set())])

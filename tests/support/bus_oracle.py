@@ -103,6 +103,7 @@ class BusOracle:
         self._seen = CarSeen()
         self._requests: dict[str, int] = {}
         self._driver_ns = _NEVER_NS
+        self._are_robots_engaged = True
         self._question_counter = 0
         self._questions: deque[tuple[int, int]] = deque(maxlen=16)
         self._asked_again_ns = _NEVER_NS
@@ -180,6 +181,7 @@ class BusOracle:
             if message.value(data, "DriverOverride"):
                 self._driver_ns = t_ns
             if message.name == "RC_SafetyStatus":
+                self._are_robots_engaged = message.choice(data, "SystemState") == "Engaged"
                 self._learn_question(t_ns, message, data)
 
     def _learn_question(self, t_ns: int, message: WireMessage, data: bytes) -> None:
@@ -260,9 +262,9 @@ class BusOracle:
         self.authority = authority
 
     def _judge_letting_go(self, t_ns: int, before: str, step: str) -> None:
-        """A moving car is let go when somebody has taken it: a driver whom the robots feel, or an operator who has said so."""
+        """A moving car is let go when somebody has taken it, a driver or an operator, or when no robot has it."""
         speed_mps = self._seen.slowest_mps
-        is_taken = t_ns - self._driver_ns <= _DRIVER_NS
+        is_taken = t_ns - self._driver_ns <= _DRIVER_NS or not self._are_robots_engaged
         is_asked = not self._knows_requests or (before == "Engage" and self._is_asked(t_ns, "DISENGAGE"))
         if speed_mps > STANDING_MPS and not is_taken and not is_asked:
             self._violate(t_ns, "abandoned", f"{step} at {speed_mps:.1f} m/s, and nobody has taken over")
