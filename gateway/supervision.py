@@ -22,7 +22,7 @@ RECOVERY_NS = 1_000_000_000
 FLOW_WINDOW_NS = 130_000_000
 """Time over which losses are counted [ns]: with 20 % lost the reaction is to come within 150 ms."""
 MAX_LOST_FRAMES = 5
-"""Frames of a bus lost in that time that are only counted, of about 80: with 1 % lost there is 1, with 20 % there are 16."""
+"""Frames lost in that time that are only counted, of about 80 on each bus: with 1 % lost there is 1, with 20 % there are 16."""
 MAX_FLOW_CYCLE_NS = 10_000_000
 MAX_LULL_NS = 10_000_000
 """Time without any frame that is usual [ns]: of messages with this cycle time that all come at once."""
@@ -73,16 +73,17 @@ class MessageWatch:
 
 
 class Flow:
-    """How many of a bus's frames that should come do come: losses that no single message shows, because a good frame follows soon.
+    """How many of the frames that should come do come: losses that no single message shows, because each is soon followed by a good frame.
 
     A message that comes more often than it should makes up for no other.
 
     Args:
+        source: of these messages, for people.
         specs: the messages to count; those slower than `MAX_FLOW_CYCLE_NS` would say something too late.
     """
 
-    def __init__(self, network: str, specs: Iterable[MessageSpec]) -> None:
-        self._network = network
+    def __init__(self, source: str, specs: Iterable[MessageSpec]) -> None:
+        self._source = source
         self._cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS}
         self._limit = len(self._cycles_ns) + MAX_LOST_FRAMES  # one of each message may just be on its way
         self._good: Counter[str] = Counter()
@@ -95,7 +96,7 @@ class Flow:
         """Count a good frame that arrived at `t_ns`."""
         self._good[spec.name] += 1
         self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
-        self._last_ns = max(t_ns, self._last_ns)
+        self._last_ns = max(t_ns, self._last_ns)  # of two buses, one is read after the other
 
     def finding(self, now_ns: int) -> Finding | None:
         """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
@@ -113,7 +114,7 @@ class Flow:
         if lost <= self._limit:
             return None
         percent = 100.0 / sum(expected)
-        return Finding(Cause.FRAMES_LOST, percent * lost, percent * self._limit, self._network)
+        return Finding(Cause.FRAMES_LOST, percent * lost, percent * self._limit, self._source)
 
 
 class Supervisor:
@@ -134,7 +135,8 @@ class Supervisor:
         self._by_name = {watch.spec.name: watch for watch in self._watches.values()}
         self._own = {arbitration_id: spec for arbitration_id, spec in catalogue.by_id.items() if spec.sender == node}
         specs = [watch.spec for watch in self._watches.values()]
-        self._flows = {network: Flow(network, [spec for spec in specs if spec.network == network]) for network in NETWORKS}
+        self._flow = Flow("buses", specs)  # finds what concerns all of them sooner
+        self._flow_of = {network: Flow(network, [spec for spec in specs if spec.network == network]) for network in NETWORKS}
         self._impostor: Finding | None = None
         self.received = 0
         self.rejected: Counter[str] = Counter()
@@ -156,7 +158,8 @@ class Supervisor:
                     cause = "range"
             watch.note(frame.t_ns, cause is None)
             if cause is None:
-                self._flows[watch.spec.network].note_good(watch.spec, frame.t_ns)
+                self._flow.note_good(watch.spec, frame.t_ns)
+                self._flow_of[watch.spec.network].note_good(watch.spec, frame.t_ns)
             else:
                 self.rejected[f"{watch.spec.name}: {cause}"] += 1
         return values
@@ -176,6 +179,6 @@ class Supervisor:
     def findings(self, now_ns: int) -> list[Finding]:
         """What is wrong with the messages now, and, once, that somebody else has sent ours."""
         impostor, self._impostor = self._impostor, None
-        flows = [flow.finding(now_ns) for flow in self._flows.values()]
+        flows = [flow.finding(now_ns) for flow in (self._flow, *self._flow_of.values())]
         candidates = [impostor, *flows, *(watch.finding(now_ns) for watch in self._watches.values())]
         return [finding for finding in candidates if finding is not None]

@@ -504,11 +504,12 @@ def test_only_the_end_of_an_engagement_is_a_disengagement():
 
 
 def test_a_reset_is_no_second_disengagement():
-    drive = engaged()
+    drive = GatewayDrive()
+    drive.car.vx_mps = 0.0
+    drive.engage()
     drive.ask(Operation.STOP)
     drive.tick()
     ended = drive.core.disengagement
-    drive.car.vx_mps = 0.0
     drive.tick(5)
     drive.ask(Operation.RESET)
     drive.tick()
@@ -686,9 +687,9 @@ def test_robots_that_have_let_go_for_a_driver_are_no_fault():
 
 @pytest.mark.req("F1")
 def test_a_car_that_a_gentle_stop_does_not_slow_is_stopped_firmly():
-    drive = engaged().tick(50)
+    drive = GatewayDrive()
     drive.car.vx_mps = 10.0  # and stays: it rolls down a hill
-    drive.tick(20)
+    drive.engage().tick(50)
     drive.ask(Operation.STOP)
     drive.tick(560)
     assert drive.core.mode is Mode.COMFORT_STOP

@@ -18,7 +18,9 @@ def run(pairs_each: int) -> list[trials.Trial]:
     for first, second in PAIRS:
         for seed in range(pairs_each):
             rng = random.Random(f"{first}+{second}/{seed}")
-            one, other = (rng.choice([fault for fault in FAULTS if fault.req == row]) for row in (first, second))
+            one = rng.choice([fault for fault in FAULTS if fault.req == first])
+            ways = [fault for fault in FAULTS if fault.req == second and (not fault.lies_about or fault.lies_about != one.lies_about)]
+            other = rng.choice(ways)
             done.append(trials.run_pair(*rng.sample([one, other], 2), seed))
     return done
 

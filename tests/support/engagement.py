@@ -30,7 +30,7 @@ class Grade(IntEnum):
     COMFORT = 1
     SAFE = 2
     FAULT = 3
-    DRIVER = 4
+    DRIVER = 4  # or nobody: the robots have not
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ CONDITIONS = {
     "VelocityLevel missing": Condition(member("silent", "VelocityLevel"), "VelocityLevel", Grade.SAFE, 9),
     "BR_Status missing": Condition(member("silent", "BR_Status"), "BR_Status", Grade.SAFE, 9),
     "SR_Status corrupt": Condition(member("corrupt", "SR_Status"), "SR_Status", Grade.SAFE, 9),
-    "not armed": Condition(field("system_state", "Disarmed", None), "not armed", Grade.SAFE, 28, is_for_engage_only=True),
+    "not armed": Condition(field("system_state", "Disarmed", None), "not armed", Grade.DRIVER, 28, is_for_engage_only=True),
     "controller silent": Condition(of_controller("is_alive", False, True), "controller silent", Grade.SAFE, 18),
     "controller degraded": Condition(
         of_controller("status", CommandStatus.DEGRADED, CommandStatus.OK), "good commands|degraded", sure_ticks=_COMMAND_TICKS

@@ -35,12 +35,14 @@ class Fault:
         name: of this way.
         inject: begins it.
         duration_ns: how long a trial watches.
+        lies_about: message whose content is wrong; two lies about one may make a truth.
     """
 
     req: str
     name: str
     inject: Callable[[World], None]
     duration_ns: int = 300 * MS
+    lies_about: str = ""
 
     def __str__(self) -> str:
         return f"{self.req} {self.name}"
@@ -54,6 +56,12 @@ def controller_dies(world: World) -> None:
     world.mark(at_ns, world.rng.choice(("F1", "F2")))
 
 
+def spoil_commands(world: World, spoil: Callable[[ControlCommand], ControlCommand | None]) -> None:
+    """From now on commands are wrong in this way, and no longer in the one before: what is due to three of those in a row is not."""
+    world.mark_end("F5")
+    world.controller.spoil = spoil
+
+
 def one_solve_missed(world: World) -> None:
     """One command does not come; the next one does."""
     missed: list[ControlCommand] = []
@@ -64,7 +72,7 @@ def one_solve_missed(world: World) -> None:
             return None
         return command
 
-    world.controller.spoil = spoil
+    spoil_commands(world, spoil)
     world.mark(random_time(world), "F3")
 
 
@@ -83,7 +91,7 @@ def solver_fails(degraded: int, then: CommandStatus | None) -> Callable[[World],
                 world.mark(command.t_ns + world.controller.delay_ns, "F4")
             return command if then is None else replace(command, status=then)
 
-        world.controller.spoil = spoil
+        spoil_commands(world, spoil)
         if degraded:
             world.mark(world.now_ns, "F3")  # as good as one missed solve: no reaction is due to three degraded commands
 
@@ -132,7 +140,7 @@ def bad_commands(kind: str, count: int = 1 << 30) -> Callable[[World], None]:
                 world.mark(command.t_ns + world.controller.delay_ns, "F5")
             return BAD_COMMANDS[kind](command, world.rng) if seen[0] <= count else command
 
-        world.controller.spoil = spoil
+        spoil_commands(world, spoil)
         if count < 3:
             world.mark(world.now_ns, "F5 one")
 
@@ -264,12 +272,14 @@ def bus_fails(state: BusState, network: str) -> Callable[[World], None]:
     def inject(world: World) -> None:
         at_ns = random_time(world)
 
-        def health(now_ns: int) -> LinkHealth:
+        def worse(now_ns: int, before: Surroundings) -> Surroundings:
+            link = LinkHealth(state=state, bus_offs=1, last_bus_off_ns=at_ns)
             if state is BusState.ERROR_ACTIVE:
-                return LinkHealth(unconfirmed_ns=now_ns - at_ns)
-            return LinkHealth(state=state, bus_offs=1, last_bus_off_ns=at_ns)
+                link = before.links.get(network, LinkHealth())
+                link = replace(link, unconfirmed_ns=max(now_ns - at_ns, link.unconfirmed_ns))
+            return replace(before, links={**before.links, network: link})
 
-        change_surroundings(world, at_ns, lambda now_ns, before: replace(before, links={**before.links, network: health(now_ns)}))
+        change_surroundings(world, at_ns, worse)
         world.is_deaf = world.is_deaf or network == "robots"
         if world.rng.random() < 0.5:
             silent = [spec.name for spec in catalogue().by_name.values() if spec.network == network and spec.sender != "GW"]
