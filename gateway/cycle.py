@@ -146,7 +146,8 @@ class ControlCycle:
     def _process(self, overruns: int, cpu_ns: int) -> Process:
         buses = self._links.buses
         traffic = buses.traffic()
-        rates_hz = {arbitration_id: rate_hz for one in traffic.values() for arbitration_id, rate_hz in one.rates_hz.items()}
+        # Of a DBC with more messages than the kernel takes filters, a link hears strangers too.
+        rates_hz = {number: rate_hz for one in traffic.values() for number, rate_hz in one.rates_hz.items() if number in self._names}
         rejected = {"controller": self._links.channel.rejected, "operator": self._links.operators.rejected}
         return Process(
             ticks_late=overruns,

@@ -40,6 +40,8 @@ class StubBuses:
         self.dead, self.dropped, self.unsent = [], {}, {}
         self.bus_errors, self.refusals = {"robots": 0}, {}
         self.recoveries = 0
+        self.links = {"robots": LinkHealth(), "navigation": LinkHealth()}
+        self.loads = {"robots": Traffic(0.25, {bench.preparation.catalogue.by_name["SR_Status"].arbitration_id: 100.0})}
 
     def receive(self):
         return self._bench.car.speak(self._bench.now_ns)
@@ -49,10 +51,10 @@ class StubBuses:
         self._bench.car.hear(frames)
 
     def health(self):
-        return {"robots": LinkHealth(), "navigation": LinkHealth()}
+        return self.links
 
     def traffic(self):
-        return {"robots": Traffic(0.25, {self._bench.preparation.catalogue.by_name["SR_Status"].arbitration_id: 100.0})}
+        return self.loads
 
     def recover(self):
         self.recoveries += 1
