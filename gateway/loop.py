@@ -87,7 +87,6 @@ class ArrivalWait:
         try:
             return bool(select.select(descriptors, [], [], remaining_s)[0])
         except (OSError, ValueError):  # a bus that has just gone
-            time.sleep(min(remaining_s, SPACING_NS * 1e-9))
             return False
 
 

@@ -8,6 +8,7 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,6 +32,7 @@ from gateway.messages import (
     Mode,
     Operation,
     OperatorReply,
+    OperatorRequest,
     VehicleState,
     pack,
 )
@@ -124,17 +126,20 @@ def test_a_controller_may_come_late_and_come_again(tmp_path):
         assert gateway.rejected == 0
 
 
-def test_a_gateway_may_come_again_while_the_controller_waits(tmp_path):
+def test_a_gateway_may_come_again_while_the_controller_waits(tmp_path, monkeypatch):
     """Its systemd unit restarts it; a controller that has nothing to answer sends nothing that could tell it so."""
+    ticks_ns = iter(range(0, 10**9, 10_000_000))
+    monkeypatch.setattr("gateway.channel.time", SimpleNamespace(monotonic_ns=lambda: next(ticks_ns)))
     paths = tmp_path / "gateway", tmp_path / "controller"
     with Channel(paths[1], paths[0], KEY) as controller:
-        for boot_id in (7, 8):
+        for boot_id in (7, 8, 9):
             gateway = Channel(*paths, KEY)
             found = []
             for _ in range(4):
                 gateway.send(replace(STATE, boot_id=boot_id))
                 found.append(controller.newest(VehicleState))
             assert found[-1].boot_id == boot_id
+            assert controller.newest(VehicleState) is None  # from here on the kernel lets in this gateway alone
             gateway._socket.close()
 
 
@@ -145,6 +150,26 @@ def test_another_key_counts_as_junk(tmp_path):
         controller.send(COMMAND)
         assert gateway.newest(ControlCommand) is None
         assert gateway.rejected == 1
+
+
+def test_a_command_behind_a_broken_connection_is_found_in_the_same_poll(ends, tmp_path, stranger):
+    gateway, controller = ends
+    assert gateway.newest(ControlCommand) is None
+    stranger.bind(str(tmp_path / "elsewhere"))
+    controller.send(COMMAND)  # lost: the kernel drops what waits when the connection goes
+    controller._socket.connect(str(tmp_path / "elsewhere"))
+    controller._connect()
+    controller.send(replace(COMMAND, seq=9))
+    assert gateway.newest(ControlCommand) == replace(COMMAND, seq=9)
+
+
+@pytest.mark.req("S2")
+def test_a_request_is_no_business_of_the_controllers_socket(ends):
+    gateway, controller = ends
+    assert gateway.newest(ControlCommand) is None
+    controller._socket.send(pack(OperatorRequest(1, 2, Operation.ENGAGE, 3), KEY))
+    assert gateway.newest(ControlCommand) is None
+    assert gateway.rejected == 1
 
 
 @pytest.mark.req("S2", "F17")
@@ -180,17 +205,34 @@ def test_junk_before_the_controller_is_there_is_bounded_counted_and_gone(tmp_pat
             assert gateway.newest(ControlCommand) == COMMAND
 
 
+class Endless:
+    """A socket on which there is always another datagram."""
+
+    def __init__(self, datagram):
+        self.calls = []
+        self._datagram = datagram
+
+    def recv(self, size):
+        assert len(self.calls) < 10_000, "it never ends"
+        self.calls.append(size)
+        return self._datagram
+
+    def recvfrom(self, size):
+        return self.recv(size), None
+
+
 @pytest.mark.req("F17", "S3")
-def test_one_poll_is_bounded(ends):
-    """However fast somebody with the key sends, a tick looks at so many datagrams."""
+def test_one_poll_is_bounded(ends, server, monkeypatch):
+    """However fast somebody sends, with the key or without, a tick looks at so many datagrams: docs/security.md has the numbers."""
     gateway, _ = ends
     assert gateway.newest(ControlCommand) is None
-    calls = []
-    endless = type("Endless", (), {"recv": lambda self, size: calls.append(size) or pack(COMMAND, KEY), "close": lambda self: None})()
-    real, gateway._socket = gateway._socket, endless
-    assert gateway.newest(ControlCommand) == COMMAND
-    gateway._socket = real
-    assert calls == [MAX_DATAGRAM_BYTES] * MAX_DATAGRAMS_PER_POLL
+    commands, junk = Endless(pack(COMMAND, KEY)), Endless(b"junk")
+    with monkeypatch.context() as patched:
+        patched.setattr(gateway, "_socket", commands)
+        patched.setattr(server, "_socket", junk)
+        assert gateway.newest(ControlCommand) == COMMAND
+        assert server.next_request() is None
+    assert commands.calls == junk.calls == [MAX_DATAGRAM_BYTES] * MAX_DATAGRAMS_PER_POLL == [2048] * 256
 
 
 def flood(path, stop):
@@ -283,6 +325,14 @@ def test_answers_that_nobody_takes_are_counted(server, tmp_path, stranger):
     assert server.next_request() == request
     server.reply(OperatorReply(1, 1, Operation.STOP, Mode.STANDBY, ()))
     assert server.unsent == 2
+
+
+def test_requests_that_nobody_takes_are_counted(tmp_path):
+    with OperatorServer(tmp_path / "operator", KEY):
+        client = OperatorClient(tmp_path / "operator", KEY)
+    with client:
+        client.send(Operation.STOP)
+        assert client.unsent == 1
 
 
 @pytest.mark.req("S2")

@@ -4,6 +4,7 @@ import socket
 import time
 import tracemalloc
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 
@@ -103,6 +104,43 @@ def test_histogram_takes_no_memory_while_it_counts():
         assert tracemalloc.get_traced_memory()[0] - before < 500
     finally:
         tracemalloc.stop()
+
+
+FRAMES, COMMAND = 3, 4
+
+
+@pytest.fixture
+def arrivals_ns(clock, monkeypatch):
+    """Stands in for the kernel: from when on each descriptor is readable [ns]."""
+    arrivals_ns = {}
+
+    def select(descriptors, _writable, _exceptional, timeout_s):
+        until_ns = clock.now_ns + round(timeout_s * 1e9)
+        awaited_ns = [arrivals_ns[one] for one in descriptors if one in arrivals_ns]
+        clock.now_ns = max(clock.now_ns, min([*awaited_ns, until_ns]))
+        return [one for one in descriptors if arrivals_ns.get(one, until_ns + 1) <= clock.now_ns], [], []
+
+    monkeypatch.setattr(loop_module, "select", SimpleNamespace(select=select))
+    return arrivals_ns
+
+
+@pytest.mark.parametrize(
+    ("arrival", "deadline_ns", "woken_ns"),
+    [
+        ({}, 2 * MS, 2 * MS),  # neither before the deadline nor after it
+        ({}, SHORTEST_NS // 2, SHORTEST_NS // 2),
+        ({}, 60_000 * MS, LONGEST_NS),
+        ({FRAMES: 1 * MS}, 2 * MS, 1 * MS),
+        ({COMMAND: 1 * MS}, 2 * MS, 1 * MS),
+        ({FRAMES: 300_000}, 2 * MS, SPACING_NS),  # frames wait for each other
+        ({COMMAND: 300_000}, 2 * MS, 300_000),  # a command for nobody
+        ({COMMAND: 0}, 2 * MS, SHORTEST_NS),
+    ],
+)
+def test_it_wakes_up_when_something_is_there_and_at_the_deadline_at_the_latest(clock, arrivals_ns, arrival, deadline_ns, woken_ns):
+    arrivals, start_ns = ArrivalWait(lambda: [FRAMES], COMMAND), clock.now_ns
+    arrivals_ns |= {descriptor: start_ns + after_ns for descriptor, after_ns in arrival.items()}
+    assert arrivals.wait(start_ns + deadline_ns) == start_ns + woken_ns
 
 
 def test_it_wakes_up_for_frames_or_at_the_deadline_and_not_too_often():
