@@ -10,17 +10,18 @@ from types import SimpleNamespace
 import can
 import pytest
 
-from dbc.can_io import MAX_FRAMES_PER_RECEIVE
+from dbc.can_io import ERROR_FLAG, MAX_FRAMES_PER_RECEIVE
 from dbc.can_link import CARE_NS, CanLink
 from dbc.catalogue import load
 from dbc.frame import CanFrame
 from dbc.health import WELL, BusState
 from dbc.link import BusSet
-from dbc.recovery import BUS_OFF_DELAYS_NS
+from dbc.recovery import BUS_OFF_DELAYS_NS, REOPENING_DELAYS_NS
+from dbc.rtnetlink import Controller
 from tests.support.processes import wait_until
 
 CATALOGUE = load()
-SR_COMMAND, SR_STATUS = (CATALOGUE.by_name[name].arbitration_id for name in ("SR_Command", "SR_Status"))
+SR_COMMAND, SR_STATUS, POS_LOCAL = (CATALOGUE.by_name[name].arbitration_id for name in ("SR_Command", "SR_Status", "PosLocal"))
 IDS = frozenset(CATALOGUE.by_id)
 POLLS = 200
 ERRORS = {
@@ -161,14 +162,45 @@ def test_ten_thousand_refusals_in_a_row_are_counted_and_forgotten_with_the_first
 
 
 @pytest.mark.req("F10")
-def test_an_operator_who_lets_a_bus_recover_forgets_what_it_refused(clock, opened):
-    with CanLink("fake:0", IDS) as link:
+def test_an_operator_who_lets_a_bus_recover_forgets_what_did_not_get_through(clock, opened):
+    with CanLink("virtual:0", IDS) as link:
+        link.send([frame()])  # nobody acknowledges it
+        clock.tick()
+        assert link.health() == replace(WELL, unconfirmed_ns=10_000_000)
+        link.recover()
+        assert link.health() == WELL
         opened.buses[0].errors["send"] = ERRORS["ENOBUFS"]
         link.send([frame()])
         clock.tick()
-        assert link.health() != WELL
+        assert link.health() == replace(WELL, unconfirmed_ns=10_000_000)
         link.recover()
         assert link.health() == WELL
+
+
+@pytest.mark.req("F10")
+def test_an_operator_lets_every_bus_recover(clock, opened):
+    with BusSet({"robots": "virtual:0", "navigation": "virtual:1"}, CATALOGUE, "GW") as buses:
+        for bus in opened.buses:
+            bus.errors["send"] = ERRORS["ENOBUFS"]
+        buses.send([frame(t_ns=clock.now_ns), frame(POS_LOCAL)])
+        clock.tick()
+        assert WELL not in buses.health().values()
+        buses.recover()
+        assert buses.health() == {"robots": WELL, "navigation": WELL}
+
+
+@pytest.mark.req("F10")
+@pytest.mark.parametrize("error", ["bare OSError", "CanOperationError", "ValueError"])
+def test_an_error_without_a_number_is_a_bus_that_has_gone_when_it_is_read_and_a_full_queue_when_it_is_sent_to(clock, opened, error):
+    with CanLink("fake:0", IDS) as link:
+        (bus,) = opened.buses
+        bus.errors["send"] = ERRORS[error]
+        link.send([frame()])
+        assert (link.health().state, link.unsent) == (BusState.ERROR_ACTIVE, {"refused": 1})
+        opened.failures.append(ERRORS[error])
+        bus.errors["recv"] = ERRORS[error]
+        link.receive()
+        assert link.health().state is BusState.DOWN
 
 
 @pytest.mark.req("F11")
@@ -308,7 +340,7 @@ def test_after_bus_off_three_attempts_then_none_before_the_operator(clock, opene
                 buses.receive()
             if bus.restarts < attempt:
                 break
-            assert 0 <= waited_ns - BUS_OFF_DELAYS_NS[attempt - 1] <= 2 * CARE_NS
+            assert 0 <= waited_ns - BUS_OFF_DELAYS_NS[attempt - 1] <= 100_000_000
             bus.error_frame(0x100)
             buses.receive()
             assert buses.health()["robots"].state is BusState.ERROR_ACTIVE
@@ -344,6 +376,16 @@ def test_a_refused_recovery_is_named_and_the_operator_may_try_again(clock, opene
             clock.tick()
             buses.receive()
         assert bus.restarts == 6
+
+
+def test_an_interface_that_cannot_leave_bus_off_says_so(clock, opened, monkeypatch):
+    monkeypatch.delattr(FakeBus, "restart")
+    with BusSet({"robots": "virtual:0", "navigation": "virtual:1"}, CATALOGUE, "GW") as buses:
+        opened.buses[0].error_frame(0x040)
+        for _ in range(20):
+            buses.receive()
+            clock.tick()
+        assert buses.refusals == {"robots": "this interface cannot"}
 
 
 @pytest.mark.req("F10", "F11")
@@ -424,3 +466,153 @@ def test_load_counts_what_is_seen_and_own_frames_once(clock, opened):
         traffic = buses.traffic()["robots"]
         assert traffic.rates_hz == {SR_COMMAND: pytest.approx(100, abs=6), SR_STATUS: pytest.approx(100, abs=6)}
         assert 200 * 111 / 500_000 * 0.9 < traffic.load_norm < 200 * 135 / 500_000 * 1.1
+
+
+# What only the kernel tells: the state that a driver reports, and how many frames were lost.
+
+
+class FakePort:
+    """A port as SocketCAN's is."""
+
+    has_echo = True
+    refusal = ""
+
+    def __init__(self, descriptor):
+        self.descriptor = descriptor
+        self.arriving, self.sent = [], []
+        self.error = 0
+        self.told = None
+        self.losses = 0
+        self.is_closed = False
+
+    def receive(self):
+        arrived, self.arriving = self.arriving, []
+        return arrived, self.error
+
+    def send(self, arbitration_id, data):
+        self.sent.append(arbitration_id)
+        return 0
+
+    def controller(self):
+        told, self.told = self.told, None
+        return told
+
+    def restart(self):
+        pass
+
+    def lost(self):
+        return self.losses
+
+    def fileno(self):
+        return self.descriptor
+
+    def close(self):
+        self.is_closed = True
+
+
+@pytest.fixture
+def ports(monkeypatch):
+    """The ports that are opened, in turn; their descriptors count from 10."""
+    ports = []
+
+    def open_port(*_target):
+        ports.append(FakePort(10 + len(ports)))
+        return ports[-1]
+
+    monkeypatch.setattr("dbc.can_link.open_port", open_port)
+    return ports
+
+
+@pytest.mark.req("F10")
+def test_what_the_driver_tells_of_its_controller_counts(clock, ports):
+    with CanLink("fake:0", IDS) as link:
+        for controller, sent in ((Controller(BusState.BUS_OFF, 248, 3), 0), (Controller(BusState.ERROR_ACTIVE, 0, 1), 1)):
+            ports[0].told = controller
+            clock.tick(CARE_NS)
+            link.receive()
+            health = link.health()
+            assert (health.state, health.tx_error_count, health.rx_error_count) == controller
+            link.send([frame()])
+            assert len(ports[0].sent) == sent
+
+
+def test_frames_lost_in_the_kernel_and_in_the_controller_are_counted_and_own_ones_may_be_among_them(clock, ports):
+    with BusSet({"robots": "virtual:0", "navigation": "virtual:0"}, CATALOGUE, "GW") as buses:
+        buses.send([frame(t_ns=clock.now_ns)])
+        clock.tick(CARE_NS)
+        buses.receive()
+        assert buses.health()["robots"].unconfirmed_ns == CARE_NS
+        ports[0].losses = 3
+        clock.tick(CARE_NS)
+        buses.receive()
+        assert buses.health()["robots"] == WELL
+        ports[0].arriving.append((ERROR_FLAG | 0x004, bytes([0, 0x01, 0, 0, 0, 0, 0, 0]), False))  # the controller's queue was full
+        buses.send([frame(t_ns=clock.now_ns)])
+        clock.tick(CARE_NS)
+        buses.receive()
+        assert buses.dropped == {"not read in time": 4}
+        assert buses.health()["robots"].unconfirmed_ns == CARE_NS  # lost frames do not excuse later ones
+
+
+def test_frames_that_were_destroyed_or_not_acknowledged_are_counted_bus_by_bus(clock, ports):
+    with BusSet({"robots": "virtual:0", "navigation": "virtual:1"}, CATALOGUE, "GW") as buses:
+        ports[1].arriving = [(ERROR_FLAG | 0x088, bytes(8), False), (ERROR_FLAG | 0x020, bytes(8), False)]
+        buses.receive()
+        assert buses.bus_errors == {"robots": 0, "navigation": 2}
+
+
+def is_up(clock, link):
+    clock.tick(CARE_NS)
+    link.receive()
+    return link.health().state is BusState.ERROR_ACTIVE
+
+
+def test_a_port_that_takes_the_place_of_another_goes_on_counting_and_leaves_none_open(clock, ports):
+    with CanLink("fake:0", IDS) as link:
+        ports[0].losses = 3
+        ports[0].error = errno.ENODEV
+        link.receive()
+        assert link.health().state is BusState.DOWN
+        wait_until(lambda: is_up(clock, link), 20.0, "the bus to be opened again")
+        assert [port.is_closed for port in ports] == [True, False]
+        ports[1].losses = 2
+        clock.tick(CARE_NS)
+        link.receive()
+        assert link.lost == 5
+    assert ports[1].is_closed
+
+
+def test_a_port_that_nobody_has_taken_yet_is_closed_with_the_link(clock, ports):
+    with CanLink("fake:0", IDS) as link:
+        ports[0].error = errno.ENODEV
+        while len(ports) < 2:
+            clock.tick(CARE_NS)
+            link.receive()
+        wait_until(lambda: not link._opener.answers.empty(), 20.0, "the new port")
+    assert [port.is_closed for port in ports] == [True, True]
+
+
+@pytest.mark.req("F10")
+def test_the_operator_need_not_wait_for_a_bus_that_has_been_down_for_long(clock, opened):
+    with CanLink("fake:0", IDS) as link:
+        opened.buses[0].errors["recv"] = ERRORS["ENODEV"]
+        opened.failures.append(ERRORS["ENODEV"])
+        for _ in range(1_000):
+            clock.tick(CARE_NS)
+            link.receive()
+            wait_until(lambda: not link._opener.answers.empty() or not link._is_opening, 20.0, "the attempt")
+        opened.failures.clear()
+        link.recover()
+        end_ns = clock.now_ns + REOPENING_DELAYS_NS[0] + 2 * CARE_NS
+        while len(opened.buses) < 2 and clock.now_ns < end_ns:
+            clock.tick(CARE_NS)
+            link.receive()
+            wait_until(lambda: not link._opener.answers.empty() or not link._is_opening, 20.0, "the attempt")
+        assert len(opened.buses) == 2
+
+
+def test_each_network_is_waited_for_on_its_own_bus(ports):
+    with BusSet({"robots": "virtual:0", "navigation": "virtual:1"}, CATALOGUE, "GW") as buses:
+        assert (buses.filenos("robots"), buses.filenos("navigation")) == ([10], [11])
+        ports[1].descriptor = -1  # some interfaces of python-can have none
+        assert (buses.filenos("robots"), buses.filenos("navigation")) == ([10], [])
