@@ -1,6 +1,7 @@
 """The rig file: one object out of a file or of options, and every mistake in one line."""
 
 import json
+import os
 import re
 import shutil
 from pathlib import Path
@@ -14,8 +15,8 @@ from dbc.errors import SetupFailure, UserMistake
 from dbc.vehicle import FOCUS
 from gateway import check
 from gateway.limits import PROFILES
-from gateway.preparation import configuration, prepare
-from gateway.record.files import FileOptions
+from gateway.preparation import configuration, prepare, start_recorder
+from gateway.record.files import BusFormat, FileOptions
 from gateway.record.session import gateway_session
 from gateway.rig import Rig, RigError, make_rig, read_rig
 from tests.support.privilege import may_not_enter
@@ -49,6 +50,11 @@ def test_smallest_file_has_every_default(rig_file):
     assert (rig.recorder, rig.metrics, rig.car.mapping) == (None, None, None)
     assert (rig.realtime.priority, rig.realtime.cpus, rig.realtime.locks_memory) == (60, (), True)
     assert (rig.daemon.watchdog_s, rig.daemon.stop_within_s) == (1.0, 45.0)
+
+
+def test_the_navigation_system_may_have_a_bus_of_its_own(rig_file):
+    rig = read_rig(rig_file(changed('buses = { robots = "xilgate:robots", navigation = "xilgate:ins" }')))
+    assert rig.buses.by_network == {"robots": "xilgate:robots", "navigation": "xilgate:ins"}
 
 
 def test_example_is_a_rig_that_starts(tmp_path):
@@ -98,6 +104,8 @@ MISTAKES = {
     "metrics = { }": ("metrics.port", "missing"),
     "metrics = { port = 70000 }": ("metrics.port", "70000", "1024 to 65000"),
     "daemon = { watchdog_s = 0.0 }": ("daemon.watchdog_s", "0.0", "0.2 to 10"),
+    "daemon = { watchdog_s = 10.1 }": ("daemon.watchdog_s", "10.1", "0.2 to 10"),
+    "daemon = { stop_within_s = 0.9 }": ("daemon.stop_within_s", "0.9", "1 to 60"),
     "daemon = { stop_within_s = inf }": ("daemon.stop_within_s", "inf", "finite"),
     'hashes = { limits = "abc" }': ("hashes.limits", "'abc'", "64 hexadecimal digits"),
     "control = { key = 7 }": ("control.key", "7", "allowed: a path"),
@@ -205,6 +213,9 @@ def test_hashes_pin_files_and_limits(rig_file):
     assert found["limits"] in wrong
     assert "hashes.other.dbc: unknown" in unknown
     assert "robots.dbc" in unknown
+    nearly = found["limits"][:-1] + ("0" if found["limits"][-1] != "0" else "1")
+    with pytest.raises(RigError, match=nearly):
+        prepare(read_rig(rig_file(with_hashes(f'limits = "{nearly}"'))))
 
 
 @pytest.mark.req("S5")
@@ -246,6 +257,46 @@ def test_a_key_that_others_can_read_is_refused(rig_file, tmp_path):
     key.chmod(0o644)
     with pytest.raises(UserMistake, match=r"rig.key: mode 0644"):
         check.check_machine(read_rig(rig_file(SMALLEST + 'control = { key = "rig.key" }')))
+
+
+def test_a_key_of_the_default_name_that_others_can_read_is_refused(rig_file, tmp_path):
+    (tmp_path / "key").write_text("5e" * 32)
+    (tmp_path / "key").chmod(0o644)
+    with pytest.raises(UserMistake, match=r"key: mode 0644"):
+        check.check_machine(read_rig(rig_file(SMALLEST + f'control = {{ directory = "{tmp_path}" }}')))
+
+
+def test_a_key_that_is_named_must_be_there(rig_file, tmp_path):
+    with pytest.raises(UserMistake, match=r"rig\.key: no such file"):
+        check.check_machine(read_rig(rig_file(SMALLEST + f'control = {{ directory = "{tmp_path}", key = "rig.key" }}')))
+
+
+@pytest.mark.req("S1")
+def test_a_private_key_of_telemetry_that_others_can_read_is_refused(rig_file, tmp_path):
+    for name in ("rig.pem", "rig.pem.key", "readers-ca.pem"):
+        (tmp_path / name).touch(0o600)
+    files = 'certificate = "rig.pem"\nprivate_key = "rig.pem.key"\nauthority = "readers-ca.pem"\n'
+    rig = read_rig(rig_file(f'{SMALLEST}control = {{ directory = "{tmp_path}" }}\n[telemetry.tls]\naddress = "192.0.2.1:7547"\n{files}'))
+    check.check_machine(rig)
+    (tmp_path / "rig.pem.key").chmod(0o644)
+    with pytest.raises(UserMistake, match=r"rig\.pem\.key: mode 0644"):
+        check.check_machine(rig)
+
+
+def test_a_directory_that_may_not_be_written_to_is_a_set_up_failure(rig_file, tmp_path, monkeypatch):
+    monkeypatch.setattr(check.os, "access", lambda path, mode: not mode & os.W_OK)  # root may write everywhere
+    with pytest.raises(SetupFailure, match=rf"^control\.directory = '{tmp_path}': not writable for this user$"):
+        check.check_machine(read_rig(rig_file(SMALLEST + f'control = {{ directory = "{tmp_path}" }}')))
+
+
+def test_the_recorder_is_told_what_the_rig_file_says(rig_file, tmp_path, monkeypatch):
+    monkeypatch.setattr("gateway.preparation.Recorder", lambda options, session, catalogue: (options, session))
+    recording = 'directory = "r", formats = ["asc", "blf"], max_file_mb = 3, max_file_s = 50.0, max_files = 7'
+    preparation = prepare(read_rig(rig_file(f"{SMALLEST}recorder = {{ {recording} }}")))
+    options, session = start_recorder(preparation, preparation.rig.recorder, 9)
+    assert re.fullmatch(r"gateway-\d{8}T\d{6}Z", options.stem)
+    assert options == FileOptions(tmp_path / "r", options.stem, (BusFormat.ASC, BusFormat.BLF), 3 << 20, 50.0, 7)
+    assert (session.boot_id, session.profile, session.mapping) == (9, "bench", None)
 
 
 def test_directories_that_are_not_there_are_set_up_failures(rig_file, tmp_path):
