@@ -16,6 +16,8 @@ import pytest
 from dbc.catalogue import GNSS_IMU_DBC, ROBOTS_DBC
 from dbc.vehicle import FOCUS
 from gateway.channel import Channel, OperatorClient, control_path
+from gateway.daemon import _heed_signals
+from gateway.housekeeping import Orders
 from gateway.messages import HORIZON_STEPS, CommandStatus, ControlCommand, Operation, VehicleState
 from tests.support import audited_gateway
 from tests.support.processes import end, free_base_port, start_xilgate, wait_until, xilgate
@@ -164,6 +166,25 @@ def test_a_control_loop_that_hangs_starves_the_watchdog_of_the_process(hub, rig)
     assert rig.process.returncode == -signal.SIGABRT
     assert '"message": "control loop hangs"' in errors
     assert "hang_at_last" in errors  # where it was
+
+
+@pytest.fixture
+def handlers():
+    """Signals as they were before."""
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_every_signal_to_end_counts_and_the_one_to_reload_ends_nothing(handlers):
+    orders = Orders()
+    _heed_signals(orders)
+    for number in (signal.SIGTERM, signal.SIGTERM, signal.SIGINT):
+        signal.raise_signal(number)
+    assert (orders.ends, orders.is_reload_asked) == (3, False)
+    signal.raise_signal(signal.SIGHUP)
+    assert (orders.ends, orders.is_reload_asked) == (3, True)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,9 @@
 """The housekeeper: the watchdog lives on the progress of the control loop, logs are made here, reloads are judged here."""
 
+import contextlib
 import logging
+import os
+import socket
 import threading
 import time
 
@@ -86,6 +89,8 @@ def test_a_loop_that_hangs_starves_the_watchdog_though_this_thread_is_well(manag
         assert [record.message for record in caplog.records] == ["control loop hangs"]  # and that once
         loop.hangs.clear()
         wait_until(lambda: manager.has_heard("WATCHDOG=1", fed + 1), 5, "fed again")
+        loop.hangs.set()
+        wait_until(lambda: len(caplog.records) == 2, 10, "another line for another hang")
 
 
 def test_nobody_is_told_where_nobody_listens():
@@ -99,6 +104,27 @@ def test_a_manager_that_has_gone_disturbs_nobody(manager, notifier):
     manager.close()
     notifier.ready(1.0)
     notifier.status("x")
+
+
+@pytest.mark.timeout(20)
+def test_a_manager_that_does_not_listen_holds_nobody_up(manager, notifier):
+    for _ in range(10_000):  # far more than its socket holds
+        notifier.alive()
+
+
+def test_a_manager_may_have_a_name_without_a_file():
+    name = f"xilgate test {os.getpid()}"
+    notifier = Notifier({"NOTIFY_SOCKET": f"@{name}"})
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager, contextlib.closing(notifier):
+        manager.bind(f"\0{name}")
+        manager.settimeout(5.0)
+        notifier.stopping()
+        assert manager.recv(4096) == b"STOPPING=1"
+
+
+def test_the_time_of_a_reload_is_told_in_microseconds(manager, notifier):
+    notifier.reloading(1_234_567_890)
+    assert manager.hear() == ["RELOADING=1\nMONOTONIC_USEC=1234567"]
 
 
 def test_without_a_watchdog_none_is_fed(manager):
@@ -142,6 +168,7 @@ def test_events_that_nobody_takes_are_counted():
     for _ in range(_MAX_EVENTS + 3):
         pulse.post(TRANSITION)
     assert pulse.events_dropped == 3
+    assert sum(1 for _ in iter(pulse.take, None)) == _MAX_EVENTS
 
 
 def test_a_bus_is_told_when_its_state_changes(notifier, caplog):
@@ -161,6 +188,28 @@ def test_a_bus_is_told_when_its_state_changes(notifier, caplog):
         ("bus of the robots: bus-off", "robots"),
         ("bus of the robots: bus-off cannot be left: Operation not permitted", "robots"),
     ]
+
+
+def test_a_record_is_told_when_it_ends_and_when_it_goes_on(notifier, caplog):
+    bench = CycleBench()
+    bench.tick(10)
+    status = bench.pulse.status
+    with caplog.at_level(logging.INFO), housekeeper(bench.pulse, bench.orders, notifier):
+        for problem in ("No space left on device", ""):
+            said = len(caplog.records)
+            bench.pulse.status = msgspec.structs.replace(status, record_problem=problem)
+            wait_until(lambda said=said: len(caplog.records) > said, 5, "a line")
+    assert [record.message for record in caplog.records] == ["record: No space left on device", "record: goes on"]
+
+
+def test_a_bus_that_goes_before_the_gateway_at_the_end_of_a_run_is_no_news(manager, notifier, caplog):
+    bench = CycleBench()
+    bench.tick(10)
+    bench.orders.ends = 1
+    bench.pulse.status = msgspec.structs.replace(bench.pulse.status, reason="nearly over", buses={"robots": "down"})
+    with caplog.at_level(logging.INFO), housekeeper(bench.pulse, bench.orders, notifier):
+        wait_until(lambda: manager.has_heard("STATUS=SILENT: nearly over"), 5, "a look at the status")
+    assert caplog.records == []
 
 
 def mistaken():
@@ -225,3 +274,16 @@ def test_a_good_reload_is_handed_to_the_control_thread(notifier):
         bench.orders.is_reload_asked = True
         wait_until(lambda: bench.pulse.successor is bench.preparation, 5, "the new configuration")
     assert not bench.orders.is_reload_asked
+
+
+def test_a_reload_that_is_asked_for_during_another_comes_after_it(notifier):
+    bench, files = CycleBench(), ["before the second change", "after it"]
+    bench.tick(10)
+
+    def prepare():
+        bench.orders.is_reload_asked = len(files) == 2  # a signal, while the file is read
+        return files.pop(0)
+
+    with housekeeper(bench.pulse, bench.orders, notifier, prepare):
+        bench.orders.is_reload_asked = True
+        wait_until(lambda: bench.pulse.successor == "after it", 5, "what was asked for last")
