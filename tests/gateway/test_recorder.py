@@ -245,6 +245,46 @@ def test_a_full_disk_costs_what_does_not_fit_and_nothing_else(tmp_path, source):
         subprocess.run(["umount", str(tmp_path)], check=True)
 
 
+def refuse(*_):
+    raise OSError(28, "No space left on device")
+
+
+@pytest.mark.req("F15")
+@pytest.mark.parametrize("refused", [0, 2])
+def test_every_file_goes_on_whole_after_a_write_that_was_refused(tmp_path, source, monkeypatch, refused):
+    files, kept = files_in(tmp_path, source), []
+    for number in range(4):
+        records = source.records(20)
+        with monkeypatch.context() as patched:
+            if number == refused:
+                patched.setattr("gateway.record.files.append_whole", refuse)
+                with pytest.raises(OSError, match="No space left"):
+                    files.append(records, float(number))
+            else:
+                files.append(records, float(number))
+                kept += [unpack_step(record, "step") for record in records]
+    head, steps, is_cut = journal(tmp_path / "gateway-0000.journal")
+    session_like(head)
+    assert ([one.seq for one in steps], is_cut) == ([one.seq for one in kept], False)
+    for suffix in READERS:
+        assert len(bus_record(tmp_path, suffix)) == sum(len(one.arguments.received) + len(one.sent) for one in kept), suffix
+
+
+@pytest.mark.req("F15")
+def test_a_file_that_refuses_takes_no_other_with_it(tmp_path, source, monkeypatch):
+    files = files_in(tmp_path, source)
+
+    def append(path, content):
+        (refuse if path.suffix == ".journal" else append_whole)(path, content)
+
+    monkeypatch.setattr("gateway.record.files.append_whole", append)
+    with pytest.raises(OSError, match="No space left"):
+        files.append(source.records(20), 0.0)
+    assert not (tmp_path / "gateway-0000.journal").exists()
+    for suffix in READERS:
+        assert len(bus_record(tmp_path, suffix)) == source.frames, suffix
+
+
 class FakeFiles:
     """Files on a disk that does what a test wants."""
 
@@ -306,6 +346,27 @@ def test_a_slow_disk_fills_the_queue_and_no_more(disk, monkeypatch):
     writer.close()
 
 
+@pytest.mark.req("F15")
+def test_what_has_been_written_makes_room_in_the_queue(disk, monkeypatch):
+    monkeypatch.setattr(writing, "WRITE_PERIOD_S", 0.01)
+    writer = RecordWriter(disk, max_queued_bytes=1000)
+    for number in range(1, 6):
+        writer.put(bytes(400))
+        wait_until(lambda number=number: writer.recorded == number, 10, "the record to be written")
+    assert writer.lost == 0
+    writer.close()
+
+
+@pytest.mark.req("F15")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_writer_that_dies_of_a_bug_is_named(disk, monkeypatch):
+    monkeypatch.setattr(writing, "WRITE_PERIOD_S", 0.01)
+    writer = RecordWriter(disk)
+    disk.error = ZeroDivisionError()
+    writer.put(b"one")
+    wait_until(lambda: writer.problem == "the writer of the record has ended", 10, "the end of the writer")
+
+
 def test_what_is_queued_is_written_at_the_end(disk):
     writer = RecordWriter(disk)
     for number in range(50):
@@ -358,6 +419,28 @@ def session_like(head):
     assert "SR_Command" in found.dbc["robots.dbc"]
     json.dumps(found.configuration)
     return found
+
+
+def test_a_tick_that_is_too_long_for_any_record_is_counted_as_lost(recorder, monkeypatch):
+    recorder, drive = recorder
+    monkeypatch.setattr("gateway.recorder.MAX_RECORD_BYTES", 10)
+    recorder.record(step(drive, time.monotonic_ns()), drive.output)
+    assert recorder.poll(time.monotonic_ns() + S).lost == 1
+
+
+def test_the_recorder_is_looked_for_ten_times_a_second(recorder):
+    recorder, _ = recorder
+    now_ns = time.monotonic_ns() + S
+    status = recorder.poll(now_ns)
+    assert recorder.poll(now_ns + 99_999_999) is status
+    assert recorder.poll(now_ns + 100_000_000) is not status
+
+
+def test_a_recorder_does_not_go_on_with_the_files_of_another(tmp_path):
+    (tmp_path / "gateway-0000.journal").write_bytes(b"of another one")
+    with pytest.raises(SetupFailure, match="there is such a record already"):
+        Recorder(FileOptions(tmp_path, "gateway"), session(), GatewayDrive().catalogue)
+    assert (tmp_path / "gateway-0000.journal").read_bytes() == b"of another one"
 
 
 def test_the_signals_that_end_a_gateway_do_not_end_its_recorder(tmp_path, recorder):
