@@ -1,10 +1,12 @@
 """The rig file: one object out of a file or of options, and every mistake in one line."""
 
+import hashlib
 import json
 import os
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given, settings
@@ -17,9 +19,10 @@ from gateway import check
 from gateway.limits import PROFILES
 from gateway.preparation import configuration, prepare, start_recorder
 from gateway.record.files import BusFormat, FileOptions
-from gateway.record.session import gateway_session
+from gateway.record.session import gateway_session, origin
 from gateway.rig import Rig, RigError, make_rig, read_rig
 from tests.support.privilege import may_not_enter
+from tests.support.site import SITE_FILES, SITE_MAPPING
 
 EXAMPLE = Path(__file__).parents[2] / "gateway" / "target" / "rig.toml"
 SMALLEST = f"""
@@ -227,6 +230,20 @@ def test_a_record_has_the_hashes_that_were_pinned(rig_file):
     for name in ("limits", "configuration", "robots.dbc"):
         assert session.sha256[name] == found[name]
     assert session.sha256["vehicle"] == found["focus.toml"]
+
+
+@pytest.mark.req("S5")
+def test_a_record_has_the_mapping_of_the_site_and_its_hash():
+    session = gateway_session(1, PROFILES["bench"], SITE_FILES, FOCUS, {}, mapping_path=SITE_MAPPING)
+    assert session.mapping == SITE_MAPPING.read_text(encoding="utf-8")
+    assert session.sha256["mapping"] == hashlib.sha256(SITE_MAPPING.read_bytes()).hexdigest()
+
+
+def test_a_machine_whose_clock_begins_in_1970_has_a_record_all_the_same(monkeypatch):
+    monkeypatch.setattr("gateway.record.session.time", SimpleNamespace(time_ns=lambda: 5, monotonic_ns=lambda: 3))
+    found = origin(1, {})
+    assert found["started_utc"] == "2000-01-01T00:00:00.000+00:00"
+    assert found["wall_offset_ns"] + 3 == 946_684_800 * 10**9
 
 
 def test_hashes_follow_what_they_stand_for(rig_file, tmp_path):
