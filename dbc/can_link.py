@@ -229,6 +229,10 @@ class CanLink:
         """Go on with a port that was opened anew; None when it did not open."""
         if port is None:
             return
+        if self._monitor.state is not BusState.DOWN:
+            # The bus has come up by itself meanwhile, and own frames are on their way that only the old port will see.
+            port.close()
+            return
         self._lost_at_closed_ports += self._port.lost()
         self._port.close()
         self._port = port

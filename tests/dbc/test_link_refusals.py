@@ -378,14 +378,16 @@ def test_a_refused_recovery_is_named_and_the_operator_may_try_again(clock, opene
         assert bus.restarts == 6
 
 
-def test_an_interface_that_cannot_leave_bus_off_says_so(clock, opened, monkeypatch):
-    monkeypatch.delattr(FakeBus, "restart")
-    with BusSet({"robots": "virtual:0", "navigation": "virtual:1"}, CATALOGUE, "GW") as buses:
-        opened.buses[0].error_frame(0x040)
+def test_an_interface_that_cannot_leave_bus_off_says_so(clock, monkeypatch):
+    bus = FakeBus()
+    without_restart = SimpleNamespace(recv=bus.recv, send=bus.send, shutdown=bus.shutdown)
+    monkeypatch.setattr("dbc.can_io.can.Bus", lambda **_: without_restart)
+    with BusSet({"robots": "virtual:0", "navigation": "virtual:0"}, CATALOGUE, "GW") as buses:
+        bus.error_frame(0x040)
         for _ in range(20):
             buses.receive()
             clock.tick()
-        assert buses.refusals == {"robots": "this interface cannot"}
+        assert buses.refusals == dict.fromkeys(["robots", "navigation"], "this interface cannot")
 
 
 @pytest.mark.req("F10", "F11")
@@ -580,6 +582,27 @@ def test_a_port_that_takes_the_place_of_another_goes_on_counting_and_leaves_none
         link.receive()
         assert link.lost == 5
     assert ports[1].is_closed
+
+
+@pytest.mark.req("F10")
+def test_a_bus_that_comes_up_by_itself_while_it_is_opened_again_keeps_its_port(clock, ports):
+    with CanLink("fake:0", IDS) as link:
+        ports[0].error = errno.ENODEV
+        while len(ports) < 2:
+            clock.tick(CARE_NS)
+            link.receive()
+        wait_until(lambda: not link._opener.answers.empty(), 20.0, "the new port")
+        ports[0].error = 0
+        ports[0].arriving.append((SR_STATUS, bytes(8), False))
+        assert len(link.receive()) == 1
+        link.send([frame(), frame()])
+        clock.tick(CARE_NS)
+        ports[0].arriving += [(SR_COMMAND, bytes(8), True)] * 2
+        link.receive()
+        assert link.health() == WELL
+        link.send([frame()])
+        assert ports[0].sent == [SR_COMMAND] * 3
+        assert [port.is_closed for port in ports] == [False, True]
 
 
 def test_a_port_that_nobody_has_taken_yet_is_closed_with_the_link(clock, ports):
