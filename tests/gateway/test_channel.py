@@ -156,7 +156,7 @@ def test_a_command_behind_a_broken_connection_is_found_in_the_same_poll(ends, tm
     gateway, controller = ends
     assert gateway.newest(ControlCommand) is None
     stranger.bind(str(tmp_path / "elsewhere"))
-    controller.send(COMMAND)  # lost: the kernel drops what waits when the connection goes
+    gateway.send(STATE)  # the kernel tells the gateway once that nobody will read this
     controller._socket.connect(str(tmp_path / "elsewhere"))
     controller._connect()
     controller.send(replace(COMMAND, seq=9))

@@ -71,6 +71,11 @@ def test_a_step_comes_back_as_it_was():
         assert plain(bytes(record.output))["state"]["seq"] == output.state.seq
 
 
+def test_what_was_received_is_in_the_order_of_its_arrival():
+    first, second, third = (CanFrame(number, b"", number) for number in (3, 1, 2))
+    assert StepArguments(9, [third], glances=[Glance(7, [first]), Glance(8, [second])]).received == [first, second, third]
+
+
 def test_equal_values_have_equal_bytes_whatever_the_order_of_what_has_none():
     assert pack_value({"b": 1, "a": frozenset({"x", "y"})}) == pack_value({"a": frozenset({"y", "x"}), "b": 1})
     assert pack_value(1) != pack_value(1.0)
