@@ -190,11 +190,11 @@ class Publisher:
 
         def reply(query: zenoh.Query) -> None:
             with query:
-                payload = query.payload or zenoh.ZBytes()
+                payload = query.payload or b""
                 if len(payload) > MAX_REQUEST_BYTES:
                     query.reply_err(f"request of {len(payload)} bytes: at most {MAX_REQUEST_BYTES}")
                 else:
-                    query.reply(key, answer(payload.to_bytes()))
+                    query.reply(key, answer(bytes(payload)))
 
         self._services.append(self._session.declare_queryable(key, zenoh.handlers.Callback(reply, indirect=False)))
 

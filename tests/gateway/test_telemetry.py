@@ -33,7 +33,7 @@ from gateway.telemetry import (
     port_of,
     topic_of,
 )
-from gateway.telemetry.security import connecting_options
+from gateway.telemetry.security import connecting_options, listening_options
 from tests.support.certificates import make_authority, make_certificate
 from tests.support.processes import free_base_port, wait_until
 
@@ -216,6 +216,18 @@ def test_a_request_that_is_too_long_is_refused_unread():
     assert asked == [MAX_REQUEST_BYTES]
 
 
+@pytest.mark.req("S3")
+def test_a_request_without_content_is_answered_as_any_other():
+    base, asked = free_base_port(), []
+    with Publisher(Source.EMULATOR, base) as publisher:
+        publisher.serve("service", lambda payload: asked.append(payload) or b"answer")
+        assert ask(Source.EMULATOR, "service", b"", base) == b"answer"
+        with telemetry._session([], [f"tcp/127.0.0.1:{port_of(Source.EMULATOR, base)}"], within_s=5.0) as session:
+            (reply,) = session.get("xilgate/emulator/service", timeout=10.0)
+            assert reply.ok.payload.to_bytes() == b"answer"
+    assert asked == [b"", b""]
+
+
 # Who may connect
 
 
@@ -357,6 +369,46 @@ def test_a_rig_of_another_authority_is_not_believed(certificates, rig):
 
 
 @pytest.mark.req("S1")
+def test_a_rig_of_another_name_is_not_believed(rig):
+    """Its certificate is good, but of 127.0.0.1 alone."""
+    tls = rig[4]("tuner")
+    renamed = tls.model_copy(update={"address": tls.address.replace("127.0.0.1", "localhost")})
+    with pytest.raises(TelemetryError):
+        ask(Source.CONTROLLER, "parameters", b"", timeout_s=1.0, tls=renamed)
+    assert ask(Source.CONTROLLER, "parameters", b"", timeout_s=10.0, tls=tls) == b"answer"
+
+
+@pytest.mark.req("S1")
+@pytest.mark.parametrize("writers", [(), ("tuner",)])
+def test_the_access_list_is_no_longer_than_it_must_be(certificates, writers):
+    """What a well-behaved Zenoh does not even send, because nobody has asked for it, a hostile one might."""
+    tls = tls_of(certificates, "rig", 7547).model_copy(update={"writers": writers})
+    access = listening_options(tls)["access_control"]
+    assert (access["enabled"], access["default_permission"]) == (True, "deny")
+    rules = {rule["id"]: rule for rule in access["rules"]}
+    protocols = {subject["id"]: subject["link_protocols"] for subject in access["subjects"]}
+    names = {subject["id"]: subject.get("cert_common_names") for subject in access["subjects"]}
+    allowed = {
+        (protocol, *(names[subject] or ["anybody"]), flow, message, key)
+        for policy in access["policies"] for subject in policy["subjects"] for protocol in protocols[subject]
+        for rule in map(rules.get, policy["rules"]) for flow in rule["flows"] for message in rule["messages"] for key in rule["key_exprs"]
+    }  # fmt: skip
+    remote = {one[1:] for one in allowed if one[0] != "tcp"}
+    reading = {("anybody", "ingress", "declare_subscriber", "xilgate/*"), ("anybody", "egress", "put", "xilgate/*")}
+    asking = {("egress", "declare_queryable"), ("ingress", "query"), ("egress", "reply")}
+    assert remote == reading | {(name, *one, "xilgate/*/*") for name in writers for one in asking}
+
+
+@pytest.mark.req("S1")
+def test_both_sides_verify_and_end_with_their_certificates(certificates):
+    tls = tls_of(certificates, "rig", 7547)
+    for options in (listening_options(tls), connecting_options(tls)):
+        link = options["transport/link/tls"]
+        assert (link["enable_mtls"], link["verify_name_on_connect"], link["close_link_on_expiration"]) == (True, True, True)
+        assert link["root_ca_certificate"] == str(tls.authority)
+
+
+@pytest.mark.req("S1")
 @pytest.mark.parametrize(
     "address",
     ["tcp/192.168.1.10:7547", "tls/192.168.1.10:7547", "192.168.1.10", ":7547", "192.168.1.10:80", "192.168.1.10:65531", "a b:7547", ""],
@@ -381,8 +433,9 @@ def test_tls_that_cannot_be_used_is_one_line(certificates, tmp_path):
     (tmp_path / "key").chmod(0o644)
     with pytest.raises(KeyMistake, match="mode 0644"):
         Publisher(Source.GATEWAY, base, tls.model_copy(update={"private_key": tmp_path / "key"}))
-    with pytest.raises(UserMistake, match=r"^/dev/zero: not a regular file$"):
-        Publisher(Source.GATEWAY, base, tls.model_copy(update={"authority": Path("/dev/zero")}))
+    for name in ("authority", "certificate"):
+        with pytest.raises(UserMistake, match=r"^/dev/zero: not a regular file$"):
+            Publisher(Source.GATEWAY, base, tls.model_copy(update={name: Path("/dev/zero")}))
     with pytest.raises(TelemetryError, match=r"viewer\.pem.* not usable") as caught:
         Publisher(Source.GATEWAY, base, tls.model_copy(update={"certificate": certificates / "viewer.pem"}))
     assert "\n" not in str(caught.value)
