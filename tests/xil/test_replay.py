@@ -100,6 +100,14 @@ def test_a_bus_that_never_has_room_ends_the_replay():
     time.refusals = 1 << 30
     with pytest.raises(SetupFailure, match="the bus of channel robots takes no frames: Transmit buffer full"):
         time.player().play([frame(0)])
+    assert time.now_ns == 10 * S  # five seconds later
+
+
+def test_a_stop_in_a_pause_of_the_record_sends_nothing_more():
+    time = FakeTime()
+    player = time.player()
+    player.play([frame(0), frame(10 * S)], lambda: time.now_ns > 6 * S)
+    assert player.played.sent == {"robots": 1}
 
 
 def test_it_can_be_stopped():

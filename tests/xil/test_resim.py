@@ -14,7 +14,7 @@ from controller.bench.loop import drive
 from controller.bench.scenarios import nominal_scenarios
 from controller.journal import ControllerSession, RecordedNmpc
 from controller.nmpc import NmpcOptions
-from controller.parameters import ParameterStore
+from controller.parameters import ParameterStore, Refused
 from controller.problem import OcpOptions
 from controller.record import controller_session, record_in
 from controller.solvers import make_solver
@@ -262,6 +262,12 @@ def test_a_forgotten_change_of_parameters_would_be_noticed(controller_run, monke
     (controller,) = resim(controller_run[0], silent)
     assert controller.different > 0
     assert controller.first.step == 19
+
+
+def test_parameters_that_this_build_refuses_are_one_clear_line(controller_run, monkeypatch):
+    monkeypatch.setattr(ParameterStore, "propose", lambda *_: Refused(reasons=["planner.safe_time_s: unknown"]))
+    with pytest.raises(JournalError, match=r"step 19: parameters that this build refuses: planner\.safe_time_s: unknown$"):
+        resim(controller_run[0], silent)
 
 
 def test_a_solve_time_that_decided_would_be_noticed(controller_run, monkeypatch):
