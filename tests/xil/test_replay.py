@@ -107,6 +107,7 @@ def test_a_stop_in_a_pause_of_the_record_sends_nothing_more():
     time = FakeTime()
     player = time.player()
     player.play([frame(0), frame(10 * S)], lambda: time.now_ns > 6 * S)
+    assert len(time.sent) == 1
     assert player.played.sent == {"robots": 1}
 
 
