@@ -433,9 +433,10 @@ def test_tls_that_cannot_be_used_is_one_line(certificates, tmp_path):
     (tmp_path / "key").chmod(0o644)
     with pytest.raises(KeyMistake, match="mode 0644"):
         Publisher(Source.GATEWAY, base, tls.model_copy(update={"private_key": tmp_path / "key"}))
-    for name in ("authority", "certificate"):
-        with pytest.raises(UserMistake, match=r"^/dev/zero: not a regular file$"):
-            Publisher(Source.GATEWAY, base, tls.model_copy(update={name: Path("/dev/zero")}))
+    with pytest.raises(UserMistake, match=r"^/dev/zero: not a regular file$"):
+        Publisher(Source.GATEWAY, base, tls.model_copy(update={"authority": Path("/dev/zero")}))
+    with pytest.raises(UserMistake, match=rf"^{tmp_path}/nowhere\.pem: No such file"):
+        Publisher(Source.GATEWAY, base, tls.model_copy(update={"certificate": tmp_path / "nowhere.pem"}))
     with pytest.raises(TelemetryError, match=r"viewer\.pem.* not usable") as caught:
         Publisher(Source.GATEWAY, base, tls.model_copy(update={"certificate": certificates / "viewer.pem"}))
     assert "\n" not in str(caught.value)
