@@ -1,7 +1,9 @@
 """The control cycle with a stub car: what it tells, how it ends, when it takes another configuration, and what it never does."""
 
+import contextlib
 import logging
 import re
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -10,17 +12,21 @@ from dbc.catalogue import NAVIGATION
 from dbc.health import BusState, LinkHealth
 from dbc.realtime import Grant
 from dbc.traffic import Traffic
+from gateway import app
 from gateway.causes import Cause
 from gateway.core import TICK_NS
 from gateway.cycle import Links
-from gateway.housekeeping import Notice
+from gateway.housekeeping import Notice, Orders
 from gateway.journal import pack_value
 from gateway.messages import Mode, Operation
 from gateway.modes import Transition
+from gateway.preparation import prepare
 from gateway.recorder import RecorderStatus
-from gateway.telemetry import StatusSample
+from gateway.rig import make_rig
+from gateway.systemd import Notifier
+from gateway.telemetry import Source, StatusSample
 from gateway.warm_up import warm_up
-from tests.support.cycle import CycleBench
+from tests.support.cycle import TREE, CycleBench
 
 
 @pytest.fixture
@@ -345,3 +351,27 @@ def test_a_reset_lets_the_buses_recover_but_not_while_the_car_is_driven(bench):
     bench.ask(Operation.RESET)
     bench.tick()
     assert bench.buses.recoveries == 1
+
+
+def test_the_process_is_made_of_what_the_rig_file_says(tmp_path, monkeypatch):
+    given = {}
+
+    def noting(name, make):
+        def noted(*arguments):
+            given[name] = arguments
+            return make(*arguments)
+
+        monkeypatch.setattr(app, name, noted)
+
+    noting("BusSet", app.BusSet)
+    noting("warm_up", app.warm_up)
+    noting("Publisher", lambda *_: contextlib.nullcontext(SimpleNamespace(post=lambda _: None, dropped=0)))
+    noting("realtime_practice", lambda *_: contextlib.nullcontext({}))
+    tls = {"address": "192.0.2.1:7547", "certificate": "a", "private_key": "b", "authority": "c"}
+    more = {"control": {"directory": str(tmp_path)}, "telemetry": {"base_port": 7000, "tls": tls}, "realtime": {"cpus": [1]}}
+    preparation = prepare(make_rig(Path("test"), TREE | more, Path("/")))
+    assert app.run(preparation, Orders(ends=1), Notifier({}), None) is None
+    assert given["BusSet"] == (preparation.rig.buses.by_network, preparation.catalogue, "GW")  # answerable for what it sends
+    assert given["Publisher"] == (Source.GATEWAY, 7000, preparation.rig.telemetry.tls)
+    assert given["warm_up"] == (preparation,)
+    assert given["realtime_practice"] == (preparation.rig.realtime,)
