@@ -37,7 +37,7 @@ class Cause(Enum):
     TICK_GAP = Meaning(20, "gateway was stopped", "ms")
     MESSAGE_MISSING = Meaning(21, "message is missing", "ms")
     MESSAGE_INVALID = Meaning(22, "message is invalid", "")
-    NAVIGATION_FROZEN = Meaning(23, "navigation data frozen", "ms")
+    NAVIGATION_FROZEN = Meaning(23, "navigation data frozen or late", "ms")
     NAVIGATION_COARSE = Meaning(24, "position mode too coarse", "")
     SPEED_IMPLAUSIBLE = Meaning(25, "speed contradicts itself or the wheels", "m/s")
     POSITION_IMPLAUSIBLE = Meaning(26, "position and speed contradict each other", "m")
