@@ -47,7 +47,7 @@ class CommandGate:
         self.bad_in_a_row = 0
         self.strangers = 0
         self.last_cause = ""
-        self._stranger_ns = 0
+        self._stranger_ns: int | None = None
         self._last: ControlCommand | None = None
         self._admitted_ns: int | None = None
 
@@ -59,7 +59,7 @@ class CommandGate:
 
     def forgive(self, now_ns: int) -> None:
         """Forget a second sender who has not been heard for long."""
-        if now_ns - self._stranger_ns > FORGIVING_NS:
+        if self._stranger_ns is not None and now_ns - self._stranger_ns > FORGIVING_NS:
             self.strangers = 0
 
     def offer(self, now_ns: int, command: ControlCommand, state_seq: int) -> bool:

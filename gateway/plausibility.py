@@ -19,8 +19,8 @@ SPEED_HOLD_NS = 100_000_000
 """Wheels that slip for a moment are no fault of a sensor."""
 BRAKE_SLIP = 0.3
 """By this share of the car's speed wheels may be slower while an anti-lock brake works: it keeps the slip below a quarter."""
-SLOWING_MPS = 0.05
-"""Loss of speed in the window below that excuses such wheels: ice gives twice as much, and a speed that is frozen none."""
+SLOWING_MPS = 0.0625
+"""Loss of speed in the window below that excuses such wheels: ice gives 0.1 m/s, and a speed that is frozen none."""
 SPEED_JUMP_MPS = 2.5
 """Change of speed in the window below that no car makes: at 1 g, and with frames lost, it is 1.9 m/s."""
 

@@ -84,13 +84,14 @@ class Flow:
 
     def __init__(self, source: str, specs: Iterable[MessageSpec]) -> None:
         self._source = source
-        self._cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS}
+        cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if spec.cycle_time_ns}
+        self._cycles_ns = {name: cycle_ns for name, cycle_ns in cycles_ns.items() if cycle_ns <= MAX_FLOW_CYCLE_NS}
         self._limit = len(self._cycles_ns) + MAX_LOST_FRAMES  # one of each message may just be on its way
         self._good: Counter[str] = Counter()
         self._paused_ns = 0
         self._last_ns = 0
-        self._before: tuple[int, int, tuple[int, ...]] | None = None
-        self._within: deque[tuple[int, int, tuple[int, ...]]] = deque()
+        self._before: tuple[int, int, Counter[str]] | None = None
+        self._within: deque[tuple[int, int, Counter[str]]] = deque()
 
     def note_good(self, spec: MessageSpec, t_ns: int) -> None:
         """Count a good frame that arrived at `t_ns`."""
@@ -101,19 +102,18 @@ class Flow:
     def finding(self, now_ns: int) -> Finding | None:
         """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
         paused_ns = self._paused_ns + max(now_ns - self._last_ns - MAX_LULL_NS, 0)
-        good = tuple(self._good[name] for name in self._cycles_ns)
-        self._within.append((now_ns, paused_ns, good))
+        self._within.append((now_ns, paused_ns, self._good.copy()))
         while self._within[0][0] <= now_ns - FLOW_WINDOW_NS:
             self._before = self._within.popleft()
         if self._before is None:
             return None
         then_ns, paused_then_ns, good_then = self._before
         elapsed_ns = now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)
-        expected = [elapsed_ns / cycle_ns for cycle_ns in self._cycles_ns.values()]
-        lost = sum(max(due + before - now, 0.0) for due, before, now in zip(expected, good_then, good, strict=True))
+        expected = {name: elapsed_ns / cycle_ns for name, cycle_ns in self._cycles_ns.items()}
+        lost = sum(max(expected[name] - (self._good[name] - good_then[name]), 0.0) for name in expected)
         if lost <= self._limit:
             return None
-        percent = 100.0 / sum(expected)
+        percent = 100.0 / sum(expected.values())
         return Finding(Cause.FRAMES_LOST, percent * lost, percent * self._limit, self._source)
 
 

@@ -57,6 +57,13 @@ def test_data_that_come_a_little_sooner_than_ever_are_taken_at_once():
     assert ages_ms((1_000, 0), (1_010, 29), (1_020, 39), (1_030, 44)) == pytest.approx([0, 0, 0, 5], abs=0.03)
 
 
+def test_the_exact_time_ahead():
+    for arrival_ns, is_taken in ((1_010_005_003, True), (1_010_005_002, False)):  # 20 ms sooner, and 5.003 us of drift in 10.005 ms
+        clock = ValidityClock()
+        clock.arrived(1_000 * MS, 0)
+        assert (clock.arrived(arrival_ns, 30) is not None) is is_taken
+
+
 def test_how_far_clocks_are_apart_can_be_learnt_anew():
     clock = ValidityClock()
     assert clock.arrived(1_000 * MS, 50) == 1_000 * MS

@@ -226,6 +226,20 @@ def test_slip_has_to_be_that_of_brakes(changes):
     assert drive.found[0].limit == pytest.approx(max(2.0, 0.3 * drive.speed_mps) if "slip" in changes else 2.0, rel=0.05)
 
 
+@pytest.mark.parametrize(("brake_norm", "slower_mps", "is_excused"), [(0.06, 0.07, True), (0.05, 0.07, False), (0.06, 0.0625, False)])
+def test_what_excuses_slip_exactly(brake_norm, slower_mps, is_excused):
+    """One step of the speed, which is remembered for 100 ms: as long as slip is tolerated anyway."""
+    drive = Drive(16.0, is_driving=False, turn_radps=0.0).step(50)
+
+    def lie(m):
+        m.vx_mps = 16.0 - slower_mps
+        m.wheel_speed_radps = (13.0 / RADIUS_M,) * 4
+        m.brake_norm = brake_norm
+
+    drive.lie = lie
+    assert drive.until_found() == (200 * MS if is_excused else 100 * MS)
+
+
 def test_brakes_make_no_wheel_faster():
     drive = Drive(34.0, is_driving=False, turn_radps=0.0).step(50)
     drive.lie = braking(drive, 5.0, -0.2)
