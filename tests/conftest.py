@@ -6,6 +6,7 @@ With pytest-xdist the processes of the run collect and run the tests, and the on
 
 import os
 import re
+import signal
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -142,4 +143,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # A shell that runs us in the background has it ignored, which our processes would inherit; some tests interrupt them.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     config.pluginmanager.register(Run(config))
