@@ -11,7 +11,6 @@ It detects faults, not attackers.
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
-from typing import NamedTuple
 
 from e2e.p02 import e2e_p02_check, e2e_p02_protect
 
@@ -140,14 +139,6 @@ class WindowRules:
     clean_ns: int = 1_000_000_000
 
 
-class _CleanRun(NamedTuple):
-    """Good frames in a row without a gap, up to the newest frame of all."""
-
-    since_ns: int
-    last_ns: int
-    frames: int
-
-
 class E2EWindow:
     """State machine over the frames of one message, good and bad (E2E_SM of AUTOSAR): Init, Valid, Invalid.
 
@@ -163,7 +154,9 @@ class E2EWindow:
         self._rules = rules
         self._mask = (1 << rules.size) - 1
         self._bad = 0  # one bit for each frame of the window, set for a bad one
-        self._run: _CleanRun | None = None
+        self._clean_frames = 0  # good ones in a row without a gap, up to the newest of all
+        self._clean_since_ns = 0
+        self._last_ns = 0
         self.state = E2EState.INIT
 
     def add(self, now_ns: int, is_good: bool) -> E2EState:
@@ -174,7 +167,10 @@ class E2EWindow:
             is_good: whether length, protection and ranges were as they must be.
         """
         self._bad = (self._bad << 1 | (not is_good)) & self._mask
-        self._run = self._longer_run(now_ns) if is_good else None
+        if not self._clean_frames or now_ns - self._last_ns > self._timeout_ns:
+            self._clean_frames, self._clean_since_ns = 0, now_ns
+        self._clean_frames = self._clean_frames + 1 if is_good else 0
+        self._last_ns = now_ns
         if self.bad_frames > self._rules.max_bad:
             self.state = E2EState.INVALID
         elif self._is_trusted(now_ns):
@@ -186,13 +182,6 @@ class E2EWindow:
         """Bad frames in the window."""
         return self._bad.bit_count()
 
-    def _longer_run(self, now_ns: int) -> _CleanRun:
-        run = self._run
-        if run is None or now_ns - run.last_ns > self._timeout_ns:
-            return _CleanRun(now_ns, now_ns, 1)
-        return _CleanRun(run.since_ns, now_ns, run.frames + 1)
-
     def _is_trusted(self, now_ns: int) -> bool:
         wait_ns = self._rules.clean_ns if self.state is E2EState.INVALID else 0
-        run = self._run
-        return run is not None and run.frames >= self._rules.min_good and now_ns - run.since_ns >= wait_ns
+        return self._clean_frames >= self._rules.min_good and now_ns - self._clean_since_ns >= wait_ns

@@ -67,8 +67,7 @@ class Cause(Enum):
         return self.value.code
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """That a cause is there, and how much of it.
 
     Args:

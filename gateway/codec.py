@@ -72,6 +72,12 @@ class Measurement:
     are_robots_ready: bool = False
     stop_source: str = "None"
 
+    @property
+    def wheels_radps(self) -> float:
+        """Speed of the wheels: their median, which one of them cannot spoil."""
+        _, slower, faster, _ = sorted(self.wheel_speed_radps)
+        return (slower + faster) / 2.0
+
 
 @dataclass(frozen=True, slots=True)
 class RobotLimits:

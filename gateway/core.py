@@ -6,7 +6,6 @@ Decode, judge, decide the mode, choose a demand, limit it, encode. Nothing here 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
 
 from dbc.catalogue import Catalogue, CatalogueError
 from dbc.frame import CanFrame
@@ -246,8 +245,7 @@ class GatewayCore:
     @property
     def _speed_mps(self) -> float:
         """By whoever says more: a car stands when navigation and wheels agree that it does."""
-        wheels_mps = median(self.measurement.wheel_speed_radps) * self._wheel_radius_m
-        return max(abs(self.measurement.vx_mps), abs(wheels_mps))
+        return max(abs(self.measurement.vx_mps), abs(self.measurement.wheels_radps) * self._wheel_radius_m)
 
     @property
     def _limiting_speed_mps(self) -> float:

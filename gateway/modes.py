@@ -139,12 +139,13 @@ class ModeMachine:
         happened: dict[Trigger, Finding | None] = dict.fromkeys(requests)
         for finding in sorted(findings, key=lambda finding: _ORDER[finding.cause], reverse=True):
             happened[REACTIONS[finding.cause]] = finding  # the gravest of a trigger stays
-        for trigger in Trigger:
-            if trigger in happened and (after := TRANSITIONS.get((self.mode, trigger))) is not None:
+        for trigger in sorted(happened, key=_URGENCY.__getitem__):
+            if (after := TRANSITIONS.get((self.mode, trigger))) is not None:
                 transition = Transition(now_ns, self.mode, after, trigger, happened[trigger])
                 self.mode, self.reason = after, transition.reason
                 return transition
         return None
 
 
+_URGENCY = {trigger: k for k, trigger in enumerate(Trigger)}
 _ORDER = {cause: k for k, cause in enumerate(Cause)}

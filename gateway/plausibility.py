@@ -6,7 +6,7 @@ that steers the car is held against another one that knows the same thing, for a
 
 import math
 from collections import deque
-from statistics import median
+from typing import NamedTuple
 
 from dbc.vehicle import Vehicle
 from gateway.causes import Cause, Finding
@@ -76,52 +76,92 @@ class _Held:
         self._since_ns = None
 
 
+class _Recent:
+    """Values of the last while, with both of its ends."""
+
+    def __init__(self, window_ns: int) -> None:
+        self._window_ns = window_ns
+        self._times_ns: deque[int] = deque()
+        self._values: deque[float] = deque()
+
+    def add(self, now_ns: int, value: float) -> None:
+        """Remember a value, and forget those that are too old."""
+        self._times_ns.append(now_ns)
+        self._values.append(value)
+        while now_ns - self._times_ns[0] > self._window_ns:
+            self._times_ns.popleft()
+            self._values.popleft()
+
+    @property
+    def smallest(self) -> float:
+        """Of these values."""
+        return min(self._values)
+
+    @property
+    def largest(self) -> float:
+        """Of these values."""
+        return max(self._values)
+
+
+class _Point(NamedTuple):
+    """A measurement, and what of the way to it speed and yaw rate do not explain, in sum since the trail began."""
+
+    time_ms: int
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    vx_mps: float
+    unexplained_x_m: float = 0.0
+    unexplained_y_m: float = 0.0
+    unexplained_yaw_rad: float = 0.0
+
+
 class _Motion:
     """Position and heading against what speed and yaw rate make of them, over the last `MOTION_WINDOW_MS` of navigation time."""
 
     def __init__(self) -> None:
-        self._before: tuple[int, float, float, float, float] | None = None
-        self._steps: deque[tuple[int, float, float, float, float]] = deque()
+        self._trail: deque[_Point] = deque()
 
     def update(self, m: Measurement) -> None:
         """Take in a measurement; nothing is new without a new time of validity."""
-        now = (m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad, m.vx_mps)
-        before = now if self._before is None else self._before
-        elapsed_ms = m.navigation_time_ms - before[0]
-        if elapsed_ms in range(1, MOTION_WINDOW_MS + 1):
-            self._steps.append(_step(before, m, elapsed_ms * 1e-3))
-            while m.navigation_time_ms - self._steps[0][0] >= MOTION_WINDOW_MS:
-                self._steps.popleft()
-        elif elapsed_ms:
-            self._steps.clear()
-        self._before = now if elapsed_ms else before
+        elapsed_ms = m.navigation_time_ms - self._trail[-1].time_ms if self._trail else math.inf
+        if elapsed_ms == 0:
+            return
+        if 0 < elapsed_ms <= MOTION_WINDOW_MS:
+            self._trail.append(_next_point(self._trail[-1], m, elapsed_ms * 1e-3))
+            while m.navigation_time_ms - self._trail[1].time_ms >= MOTION_WINDOW_MS:
+                self._trail.popleft()
+        else:
+            self._trail = deque([_Point(m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad, m.vx_mps)])
 
     @property
     def position_error_m(self) -> float:
         """How far the position has moved otherwise than the speed says."""
-        return math.hypot(sum(x_m for _, x_m, *_ in self._steps), sum(y_m for _, _, y_m, *_ in self._steps))
+        first, last = self._trail[0], self._trail[-1]
+        return math.hypot(last.unexplained_x_m - first.unexplained_x_m, last.unexplained_y_m - first.unexplained_y_m)
 
     @property
     def yaw_rate_error_radps(self) -> float:
         """How much faster the heading has turned than the yaw rate says, mean over the window."""
-        return sum(yaw_rad for *_, yaw_rad, _ in self._steps) / (MOTION_WINDOW_MS * 1e-3)
+        return (self._trail[-1].unexplained_yaw_rad - self._trail[0].unexplained_yaw_rad) / (MOTION_WINDOW_MS * 1e-3)
 
     @property
     def speed_change_mps(self) -> float:
         """By how much the car has become faster."""
-        return sum(vx_mps for *_, vx_mps in self._steps)
+        return self._trail[-1].vx_mps - self._trail[0].vx_mps
 
 
-def _step(before: tuple[int, float, float, float, float], m: Measurement, elapsed_s: float) -> tuple[int, float, float, float, float]:
-    """Time; what of the step in x, y and heading is not explained by speed and yaw rate; and the step of the speed."""
-    _, x_m, y_m, yaw_rad, vx_mps = before
+def _next_point(before: _Point, m: Measurement, elapsed_s: float) -> _Point:
     cosine, sine = math.cos(m.yaw_rad), math.sin(m.yaw_rad)
-    return (
+    return _Point(
         m.navigation_time_ms,
-        m.x_m - x_m - (m.vx_mps * cosine - m.vy_mps * sine) * elapsed_s,
-        m.y_m - y_m - (m.vx_mps * sine + m.vy_mps * cosine) * elapsed_s,
-        math.remainder(m.yaw_rad - yaw_rad, math.tau) - m.yaw_rate_radps * elapsed_s,
-        m.vx_mps - vx_mps,
+        m.x_m,
+        m.y_m,
+        m.yaw_rad,
+        m.vx_mps,
+        before.unexplained_x_m + m.x_m - before.x_m - (m.vx_mps * cosine - m.vy_mps * sine) * elapsed_s,
+        before.unexplained_y_m + m.y_m - before.y_m - (m.vx_mps * sine + m.vy_mps * cosine) * elapsed_s,
+        before.unexplained_yaw_rad + math.remainder(m.yaw_rad - before.yaw_rad, math.tau) - m.yaw_rate_radps * elapsed_s,
     )
 
 
@@ -137,11 +177,10 @@ class Plausibility:
         self._is_on_lift = is_on_lift
         self._wheel_radius_m = vehicle.model.wheel_radius_m
         self._steering_limit_radps = STEERING_RATE_SHARE * robot.rate_limit_radps
-        self._following_ns = FOLLOWING_NS + round(robot.dead_time_s * _NS_PER_S)
         self._motion = _Motion()
         self._steered: tuple[int, float] | None = None
-        self._demands_rad: deque[tuple[int, float]] = deque()
-        self._pedal_demands: deque[tuple[int, float, float]] = deque()
+        self._asked_rad = _Recent(FOLLOWING_NS + round(robot.dead_time_s * _NS_PER_S))
+        self._asked_brake_norm, self._asked_accelerator_norm = _Recent(PEDAL_WINDOW_NS), _Recent(PEDAL_WINDOW_NS)
         self._speed, self._jump = _Held(SPEED_HOLD_NS), _Held(MOTION_HOLD_NS)
         self._position, self._yaw_rate = _Held(MOTION_HOLD_NS), _Held(MOTION_HOLD_NS)
         self._following = _Held(FOLLOWING_HOLD_NS)
@@ -154,12 +193,9 @@ class Plausibility:
             demand: what the robots were asked for last.
             is_driving: whether they are to follow it.
         """
-        self._demands_rad.append((now_ns, demand.steering_wheel_rad))
-        while now_ns - self._demands_rad[0][0] > self._following_ns:
-            self._demands_rad.popleft()
-        self._pedal_demands.append((now_ns, demand.accelerator_norm, demand.brake_norm))
-        while now_ns - self._pedal_demands[0][0] > PEDAL_WINDOW_NS:
-            self._pedal_demands.popleft()
+        self._asked_rad.add(now_ns, demand.steering_wheel_rad)
+        self._asked_brake_norm.add(now_ns, demand.brake_norm)
+        self._asked_accelerator_norm.add(now_ns, demand.accelerator_norm)
         found = self._judge_steering_rate(now_ns, measurement)
         if measurement.navigation_time_ms >= 0:
             found += self._judge_navigation(now_ns, measurement)
@@ -173,7 +209,7 @@ class Plausibility:
 
     def _judge_navigation(self, now_ns: int, m: Measurement) -> list[Finding]:
         self._motion.update(m)
-        wheels_mps = m.vx_mps if self._is_on_lift else median(m.wheel_speed_radps) * self._wheel_radius_m
+        wheels_mps = m.vx_mps if self._is_on_lift else m.wheels_radps * self._wheel_radius_m
         position_limit_m = clamp(0.5 * abs(m.vx_mps) * MOTION_WINDOW_MS * 1e-3, *POSITION_LIMITS_M)
         checks = (
             (self._speed, Cause.SPEED_IMPLAUSIBLE, "wheels", wheels_mps - m.vx_mps, self._speed_limit_mps(m, wheels_mps)),
@@ -207,18 +243,17 @@ class Plausibility:
         return [Finding(Cause.STEERING_IMPLAUSIBLE, rate_radps, self._steering_limit_radps, "SR")]
 
     def _judge_following(self, now_ns: int, m: Measurement) -> list[Finding]:
-        demanded_rad = [angle_rad for _, angle_rad in self._demands_rad]
-        error_rad = max(m.steering_wheel_rad - max(demanded_rad), min(demanded_rad) - m.steering_wheel_rad)
+        error_rad = max(m.steering_wheel_rad - self._asked_rad.largest, self._asked_rad.smallest - m.steering_wheel_rad)
         if not self._following.update(now_ns, error_rad > FOLLOWING_LIMIT_RAD):
             return []
         return [Finding(Cause.STEERING_NOT_FOLLOWING, error_rad, FOLLOWING_LIMIT_RAD, "SR")]
 
     def _judge_pedals(self, now_ns: int, m: Measurement) -> list[Finding]:
-        asked_accelerator_norm = max(accelerator_norm for _, accelerator_norm, _ in self._pedal_demands)
-        asked_brake_norm = max(brake_norm for *_, brake_norm in self._pedal_demands)
+        brake_norm = max(m.brake_norm, self._asked_brake_norm.largest)
+        accelerator_norm = max(m.accelerator_norm, self._asked_accelerator_norm.largest)
         feet = (
-            (self._brake, Cause.DRIVER_BRAKES, m.brake_pedal_norm - max(m.brake_norm, asked_brake_norm)),
-            (self._accelerator, Cause.DRIVER_ACCELERATES, m.accelerator_pedal_norm - max(m.accelerator_norm, asked_accelerator_norm)),
+            (self._brake, Cause.DRIVER_BRAKES, m.brake_pedal_norm - brake_norm),
+            (self._accelerator, Cause.DRIVER_ACCELERATES, m.accelerator_pedal_norm - accelerator_norm),
         )
         return [
             Finding(cause, deeper_norm, PEDAL_LIMIT_NORM, "CAR_Powertrain")

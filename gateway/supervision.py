@@ -7,6 +7,7 @@ is invalid until it has been good for a while, even though enough good ones come
 
 from collections import Counter, deque
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 from dbc.catalogue import NETWORKS, Catalogue, DecodeError, MessageSpec
 from dbc.e2e import E2EReceiver, E2EState, E2EWindow, WindowRules
@@ -31,6 +32,7 @@ MAX_PAUSE_NS = 40_000_000
 
 _RULES = WindowRules(WINDOW_FRAMES, MAX_BAD_FRAMES, clean_ns=RECOVERY_NS)
 _MS_PER_NS = 1e-6
+_NS_PER_S = 1e9
 
 
 class MessageWatch:
@@ -72,49 +74,69 @@ class MessageWatch:
         return None
 
 
-class Flow:
-    """How many of the frames that should come do come: losses that no single message shows, because each is soon followed by a good frame.
-
-    A message that comes more often than it should makes up for no other.
+class Losses(NamedTuple):
+    """What did not come of some messages: losses that no single message shows, because each is soon followed by a good frame.
 
     Args:
-        source: of these messages, for people.
+        lost: frames within the last `FLOW_WINDOW_NS`.
+        expected: frames in that time.
+        messages: how many are counted.
+    """
+
+    lost: float
+    expected: float
+    messages: int
+
+    def finding(self, source: str) -> Finding | None:
+        """Whether they are too many; `source` names the messages for people."""
+        limit = self.messages + MAX_LOST_FRAMES  # one of each message may just be on its way
+        if self.lost <= limit:
+            return None
+        percent = 100.0 / self.expected
+        return Finding(Cause.FRAMES_LOST, percent * self.lost, percent * limit, source)
+
+
+class Flow:
+    """Counts the frames of one bus that come against those that should. A message that comes too often makes up for no other.
+
+    Args:
         specs: the messages to count; those slower than `MAX_FLOW_CYCLE_NS` would say something too late.
     """
 
-    def __init__(self, source: str, specs: Iterable[MessageSpec]) -> None:
-        self._source = source
-        cycles_ns = {spec.name: spec.cycle_time_ns for spec in specs if spec.cycle_time_ns}
-        self._cycles_ns = {name: cycle_ns for name, cycle_ns in cycles_ns.items() if cycle_ns <= MAX_FLOW_CYCLE_NS}
-        self._limit = len(self._cycles_ns) + MAX_LOST_FRAMES  # one of each message may just be on its way
-        self._good: Counter[str] = Counter()
+    def __init__(self, specs: Iterable[MessageSpec]) -> None:
+        fast = [spec for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS]
+        self._rates_hz = [_NS_PER_S / spec.cycle_time_ns for spec in fast]
+        self._number = {spec.name: number for number, spec in enumerate(fast)}
+        self._good = [0] * len(fast)
         self._paused_ns = 0
         self._last_ns = 0
-        self._before: tuple[int, int, Counter[str]] | None = None
-        self._within: deque[tuple[int, int, Counter[str]]] = deque()
+        self._before: tuple[int, int, list[int]] | None = None
+        self._within: deque[tuple[int, int, list[int]]] = deque()
 
     def note_good(self, spec: MessageSpec, t_ns: int) -> None:
         """Count a good frame that arrived at `t_ns`."""
-        self._good[spec.name] += 1
-        self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
-        self._last_ns = max(t_ns, self._last_ns)  # of two buses, one is read after the other
+        if (number := self._number.get(spec.name)) is not None:
+            self._good[number] += 1
+        if (lull_ns := t_ns - self._last_ns) > MAX_LULL_NS:
+            self._paused_ns += lull_ns - MAX_LULL_NS
+        self._last_ns = t_ns
 
-    def finding(self, now_ns: int) -> Finding | None:
-        """Whether too many were lost within the last `FLOW_WINDOW_NS`."""
+    def losses(self, now_ns: int) -> Losses:
+        """What was lost until now; nothing while less than `FLOW_WINDOW_NS` has been seen."""
         paused_ns = self._paused_ns + max(now_ns - self._last_ns - MAX_LULL_NS, 0)
-        self._within.append((now_ns, paused_ns, self._good.copy()))
+        self._within.append((now_ns, paused_ns, self._good[:]))
         while self._within[0][0] <= now_ns - FLOW_WINDOW_NS:
             self._before = self._within.popleft()
         if self._before is None:
-            return None
+            return Losses(0.0, 0.0, len(self._good))
         then_ns, paused_then_ns, good_then = self._before
-        elapsed_ns = now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)
-        expected = {name: elapsed_ns / cycle_ns for name, cycle_ns in self._cycles_ns.items()}
-        lost = sum(max(expected[name] - (self._good[name] - good_then[name]), 0.0) for name in expected)
-        if lost <= self._limit:
-            return None
-        percent = 100.0 / sum(expected.values())
-        return Finding(Cause.FRAMES_LOST, percent * lost, percent * self._limit, self._source)
+        elapsed_s = (now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)) / _NS_PER_S
+        lost = expected = 0.0
+        for rate_hz, good, then in zip(self._rates_hz, self._good, good_then, strict=True):
+            expected += elapsed_s * rate_hz
+            if (missing := elapsed_s * rate_hz - (good - then)) > 0.0:
+                lost += missing
+        return Losses(lost, expected, len(self._good))
 
 
 class Supervisor:
@@ -135,8 +157,7 @@ class Supervisor:
         self._by_name = {watch.spec.name: watch for watch in self._watches.values()}
         self._own = {arbitration_id: spec for arbitration_id, spec in catalogue.by_id.items() if spec.sender == node}
         specs = [watch.spec for watch in self._watches.values()]
-        self._flow = Flow("buses", specs)  # finds what concerns all of them sooner
-        self._flow_of = {network: Flow(network, [spec for spec in specs if spec.network == network]) for network in NETWORKS}
+        self._flows = {network: Flow(spec for spec in specs if spec.network == network) for network in NETWORKS}
         self._impostor: Finding | None = None
         self.received = 0
         self.rejected: Counter[str] = Counter()
@@ -158,8 +179,7 @@ class Supervisor:
                     cause = "range"
             watch.note(frame.t_ns, cause is None)
             if cause is None:
-                self._flow.note_good(watch.spec, frame.t_ns)
-                self._flow_of[watch.spec.network].note_good(watch.spec, frame.t_ns)
+                self._flows[watch.spec.network].note_good(watch.spec, frame.t_ns)
             else:
                 self.rejected[f"{watch.spec.name}: {cause}"] += 1
         return values
@@ -179,6 +199,11 @@ class Supervisor:
     def findings(self, now_ns: int) -> list[Finding]:
         """What is wrong with the messages now, and, once, that somebody else has sent ours."""
         impostor, self._impostor = self._impostor, None
-        flows = [flow.finding(now_ns) for flow in (self._flow, *self._flow_of.values())]
-        candidates = [impostor, *flows, *(watch.finding(now_ns) for watch in self._watches.values())]
+        candidates = [impostor, *self._lossy(now_ns), *(watch.finding(now_ns) for watch in self._watches.values())]
         return [finding for finding in candidates if finding is not None]
+
+    def _lossy(self, now_ns: int) -> list[Finding | None]:
+        """Each bus that loses too much, and all together: what concerns all of them shows in the sum sooner."""
+        found = {network: flow.losses(now_ns) for network, flow in self._flows.items()}
+        total = Losses(*map(sum, zip(*found.values(), strict=True)))
+        return [total.finding("buses"), *(losses.finding(network) for network, losses in found.items())]
