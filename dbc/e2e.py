@@ -154,9 +154,7 @@ class E2EWindow:
         self._rules = rules
         self._mask = (1 << rules.size) - 1
         self._bad = 0  # one bit for each frame of the window, set for a bad one
-        self._clean_frames = 0  # good ones in a row without a gap, up to the newest of all
-        self._clean_since_ns = 0
-        self._last_ns = 0
+        self._clean_frames = self._clean_since_ns = self._last_ns = 0  # good ones in a row without a gap, up to the newest of all
         self.state = E2EState.INIT
 
     def add(self, now_ns: int, is_good: bool) -> E2EState:

@@ -125,13 +125,11 @@ class _Motion:
     def update(self, m: Measurement) -> None:
         """Take in a measurement; nothing is new without a new time of validity."""
         elapsed_ms = m.navigation_time_ms - self._trail[-1].time_ms if self._trail else math.inf
-        if elapsed_ms == 0:
-            return
-        if 0 < elapsed_ms <= MOTION_WINDOW_MS:
+        if elapsed_ms in range(1, MOTION_WINDOW_MS + 1):
             self._trail.append(_next_point(self._trail[-1], m, elapsed_ms * 1e-3))
             while m.navigation_time_ms - self._trail[1].time_ms >= MOTION_WINDOW_MS:
                 self._trail.popleft()
-        else:
+        elif elapsed_ms:
             self._trail = deque([_Point(m.navigation_time_ms, m.x_m, m.y_m, m.yaw_rad, m.vx_mps)])
 
     @property

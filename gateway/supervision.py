@@ -96,6 +96,9 @@ class Losses(NamedTuple):
         return Finding(Cause.FRAMES_LOST, percent * self.lost, percent * limit, source)
 
 
+NOTHING_LOST = Losses(0.0, 0.0, 0)
+
+
 class Flow:
     """Counts the frames of one bus that come against those that should. A message that comes too often makes up for no other.
 
@@ -104,12 +107,11 @@ class Flow:
     """
 
     def __init__(self, specs: Iterable[MessageSpec]) -> None:
-        fast = [spec for spec in specs if 0 < spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS]
+        fast = [spec for spec in specs if spec.cycle_time_ns and spec.cycle_time_ns <= MAX_FLOW_CYCLE_NS]
         self._rates_hz = [_NS_PER_S / spec.cycle_time_ns for spec in fast]
         self._number = {spec.name: number for number, spec in enumerate(fast)}
         self._good = [0] * len(fast)
-        self._paused_ns = 0
-        self._last_ns = 0
+        self._paused_ns = self._last_ns = 0
         self._before: tuple[int, int, list[int]] | None = None
         self._within: deque[tuple[int, int, list[int]]] = deque()
 
@@ -117,8 +119,7 @@ class Flow:
         """Count a good frame that arrived at `t_ns`."""
         if (number := self._number.get(spec.name)) is not None:
             self._good[number] += 1
-        if (lull_ns := t_ns - self._last_ns) > MAX_LULL_NS:
-            self._paused_ns += lull_ns - MAX_LULL_NS
+        self._paused_ns += max(t_ns - self._last_ns - MAX_LULL_NS, 0)
         self._last_ns = t_ns
 
     def losses(self, now_ns: int) -> Losses:
@@ -128,14 +129,14 @@ class Flow:
         while self._within[0][0] <= now_ns - FLOW_WINDOW_NS:
             self._before = self._within.popleft()
         if self._before is None:
-            return Losses(0.0, 0.0, len(self._good))
+            return NOTHING_LOST
         then_ns, paused_then_ns, good_then = self._before
         elapsed_s = (now_ns - then_ns - min(paused_ns - paused_then_ns, MAX_PAUSE_NS)) / _NS_PER_S
         lost = expected = 0.0
-        for rate_hz, good, then in zip(self._rates_hz, self._good, good_then, strict=True):
-            expected += elapsed_s * rate_hz
-            if (missing := elapsed_s * rate_hz - (good - then)) > 0.0:
-                lost += missing
+        for number, rate_hz in enumerate(self._rates_hz):
+            due = elapsed_s * rate_hz
+            lost += max(due - (self._good[number] - good_then[number]), 0.0)
+            expected += due
         return Losses(lost, expected, len(self._good))
 
 
@@ -205,5 +206,6 @@ class Supervisor:
     def _lossy(self, now_ns: int) -> list[Finding | None]:
         """Each bus that loses too much, and all together: what concerns all of them shows in the sum sooner."""
         found = {network: flow.losses(now_ns) for network, flow in self._flows.items()}
-        total = Losses(*map(sum, zip(*found.values(), strict=True)))
+        each = found.values()
+        total = Losses(sum(one.lost for one in each), sum(one.expected for one in each), sum(one.messages for one in each))
         return [total.finding("buses"), *(losses.finding(network) for network, losses in found.items())]
