@@ -584,14 +584,19 @@ def test_a_port_that_takes_the_place_of_another_goes_on_counting_and_leaves_none
     assert ports[1].is_closed
 
 
+def await_new_port(link, clock):
+    """Until the bus has been opened again, and nobody has taken the port yet."""
+    while not link._is_opening:
+        clock.tick(CARE_NS)
+        link.receive()
+    wait_until(lambda: not link._opener.answers.empty(), 20.0, "the new port")
+
+
 @pytest.mark.req("F10")
 def test_a_bus_that_comes_up_by_itself_while_it_is_opened_again_keeps_its_port(clock, ports):
     with CanLink("fake:0", IDS) as link:
         ports[0].error = errno.ENODEV
-        while not link._is_opening:
-            clock.tick(CARE_NS)
-            link.receive()
-        wait_until(lambda: not link._opener.answers.empty(), 20.0, "the new port")
+        await_new_port(link, clock)
         ports[0].error = 0
         ports[0].arriving.append((SR_STATUS, bytes(8), False))
         assert len(link.receive()) == 1
@@ -608,10 +613,7 @@ def test_a_bus_that_comes_up_by_itself_while_it_is_opened_again_keeps_its_port(c
 def test_a_port_that_nobody_has_taken_yet_is_closed_with_the_link(clock, ports):
     with CanLink("fake:0", IDS) as link:
         ports[0].error = errno.ENODEV
-        while not link._is_opening:
-            clock.tick(CARE_NS)
-            link.receive()
-        wait_until(lambda: not link._opener.answers.empty(), 20.0, "the new port")
+        await_new_port(link, clock)
     assert [port.is_closed for port in ports] == [True, True]
 
 

@@ -265,6 +265,15 @@ def test_when_all_the_senders_pause_nothing_is_lost():
         assert traffic.run(20, lambda _: True) == []
 
 
+@pytest.mark.req("F9")
+def test_a_pause_of_one_bus_is_no_loss_in_the_sum_either():
+    for is_paused in (lambda k: k < len(FAST), lambda k: k >= len(FAST)):
+        traffic = Traffic(*FAST, *ROBOTS)
+        traffic.run(20, lambda _: True)
+        assert traffic.run(4, lambda k, is_paused=is_paused: not is_paused(k)) == []
+        assert traffic.run(20, lambda _: True) == []
+
+
 def test_the_exact_number_of_losses_beside_a_pause():
     traffic = Traffic(*FAST)
     traffic.run(20, lambda _: True)
