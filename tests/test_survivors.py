@@ -34,6 +34,10 @@ def test_every_survivor_has_its_reason_and_every_reason_its_survivor():
     assert list(problems([], [FOUND])) == ["explained, but no survivor: gateway/core.py: Core.step: `self.x = 0` -> `self.x = 1`"]
 
 
+def test_a_run_that_was_not_whole_says_nothing_of_the_rest():
+    assert list(problems([FOUND], [FOUND], 3)) == ["3 mutants not checked: the run was not whole"]
+
+
 def test_few_may_be_explained():
     many = [FOUND._replace(function=f"f{k}") for k in range(MAX_EXPLAINED + 1)]
     assert list(problems(many, many)) == ["6 explained survivors, at most 5 are allowed"]

@@ -19,6 +19,8 @@ EXPLAINED = Path(__file__).resolve().parents[2] / "docs" / "mutation.md"
 MAX_EXPLAINED = 5
 DEAD = ("killed", "timeout", "caught by type check")
 """A change that the type checker refuses cannot be merged; one that makes a test run forever fails it."""
+UNCHECKED = ("not checked", "check was interrupted by user")
+"""Of a run that was not whole."""
 
 _ROW = re.compile(r"^\| `(?P<module>[^`]+)` \| `(?P<function>[^`]+)` \| `(?P<before>[^`]+)` \| `(?P<after>[^`]+)` \| .+ \|$")
 _NAME = re.compile(r"x_(?P<plain>\w+?)__mutmut_\d+$|xǁ(?P<owner>\w+)ǁ(?P<method>\w+?)__mutmut_\d+$")
@@ -50,8 +52,10 @@ def survivor(module: str, name: str, diff: str) -> Survivor:
     return Survivor(module, function, before, after)
 
 
-def problems(survivors: list[Survivor], reasons: list[Survivor]) -> Iterator[str]:
-    """What is wrong; nothing when every survivor has its reason, and every reason its survivor."""
+def problems(survivors: list[Survivor], reasons: list[Survivor], unchecked: int = 0) -> Iterator[str]:
+    """What is wrong; nothing when every mutant was checked, every survivor has its reason, and every reason its survivor."""
+    if unchecked:
+        yield f"{unchecked} mutants not checked: the run was not whole"
     for found in survivors:
         if found not in reasons:
             yield f"no test fails: {found.module}: {found.function}: `{found.before}` -> `{found.after}`"
@@ -72,12 +76,13 @@ def main() -> int:
         for name, exit_code in data.exit_code_by_key.items():
             status = status_by_exit_code[exit_code]
             counts[str(path)][status] += 1
-            if status not in DEAD:
+            if status not in (*DEAD, *UNCHECKED):
                 shown = subprocess.run([Path(sys.executable).with_name("mutmut"), "show", name], capture_output=True, text=True, check=True)
                 survivors.append(survivor(str(path), name, shown.stdout))
     for module, count in counts.items():
         print(f"{module}: {count.total()} mutants: " + ", ".join(f"{number} {status}" for status, number in sorted(count.items())))
-    wrong = list(problems(survivors, explained(EXPLAINED.read_text(encoding="utf-8"))))
+    unchecked = sum(count[status] for count in counts.values() for status in UNCHECKED)
+    wrong = list(problems(survivors, explained(EXPLAINED.read_text(encoding="utf-8")), unchecked))
     print(f"{sum(count.total() for count in counts.values())} mutants, {len(survivors)} survivors, {len(wrong)} without explanation")
     print(*wrong, sep="\n")
     return 1 if wrong or not counts else 0
