@@ -23,9 +23,25 @@ EXIT_FAIL, EXIT_USER, EXIT_SETUP, EXIT_INTERRUPTED = 1, 2, 3, 130
 DbcOption = Annotated[list[Path], typer.Option("--dbc", help="DBC file; repeat for several")]
 MappingOption = Annotated[Path | None, typer.Option("--mapping", help="TOML file of the names and units that a site's DBC has for ours")]
 VehicleOption = Annotated[Path, typer.Option("--vehicle", help="vehicle file")]
-PortOption = Annotated[int, typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry")]
+
+
+def _either(context: typer.Context, value: Any) -> Any:  # noqa: ANN401 - of both options
+    """Refuse one of two options that exclude each other: whichever comes second finds the other one given."""
+    given = [context.get_parameter_source(name) for name in ("telemetry_port", "tls")]
+    if all(source is not None and source.name == "COMMANDLINE" for source in given):
+        raise UserMistake("--telemetry-port: not beside --tls; the address of the other machine in that file names its port")
+    return value
+
+
+PortOption = Annotated[
+    int,
+    typer.Option("--telemetry-port", min=1024, max=65000, help="first of five loopback ports for telemetry", callback=_either),
+]
 TlsOption = Annotated[
-    Path | None, typer.Option("--tls", help="instead of --telemetry-port: TOML file with address of another machine and our certificate")
+    Path | None,
+    typer.Option(
+        "--tls", help="instead of --telemetry-port: TOML file with address of another machine and our certificate", callback=_either
+    ),
 ]
 ControlOption = Annotated[
     Path | None, typer.Option("--control", help="directory of the control sockets and their key; default: one of the user's own")

@@ -192,3 +192,12 @@ def test_a_rig_that_is_another_machine_is_tuned_by_its_writers_and_watched_by_it
     for command in (["watch"], ["params", "list"]):
         finished = xilgate(*command, "--tls", str(mistaken))
         assert (finished.returncode, finished.stderr) == (2, f"xilgate: {tmp_path}/none.pem: No such file or directory\n")
+
+
+@pytest.mark.parametrize("command", [["watch"], ["view"], ["params", "list"], ["params", "set", f"{SAFE_TIME}=1.9"]])
+def test_a_port_of_this_machine_and_another_machine_exclude_each_other(command, tmp_path):
+    port, machine = ["--telemetry-port", "47500"], ["--tls", str(tmp_path / "tls.toml")]
+    for options in ([*port, *machine], [*machine, *port]):
+        finished = xilgate(*command, *options)
+        assert finished.returncode == 2
+        assert finished.stderr.startswith("xilgate: --telemetry-port: not beside --tls")
