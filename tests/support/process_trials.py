@@ -204,10 +204,13 @@ def _gateway_signalled(number: signal.Signals) -> Inject:
     return lambda bench, dice: bench.signal_gateway(number)
 
 
-def _gateway_sleeps(bench: ProcessBench, dice: random.Random) -> int:
-    bench.signal_gateway(signal.SIGSTOP)
-    time.sleep(0.5)
-    return bench.signal_gateway(signal.SIGCONT)
+def _gateway_sleeps(seconds: float) -> Inject:
+    def inject(bench: ProcessBench, dice: random.Random) -> int:
+        bench.signal_gateway(signal.SIGSTOP)
+        time.sleep(seconds)
+        return bench.signal_gateway(signal.SIGCONT)
+
+    return inject
 
 
 def _flood(kind: str) -> Inject:
@@ -239,7 +242,8 @@ WAYS = (
     Way("F11", "unknown identifiers", "F11 idle", "ENGAGED", _strangers, _quiet_again),
     Way("F12", "gateway killed", "F12", "", _gateway_signalled(signal.SIGKILL), ProcessBench.restart_gateway),
     Way("F12", "gateway stopped", "F12", "", _gateway_signalled(signal.SIGSTOP), ProcessBench.restart_gateway),
-    Way("F13", "gateway sleeps for 500 ms", "F13", "SAFE_STOP", _gateway_sleeps),
+    Way("F13", "gateway sleeps for 70 ms", "F13", "SAFE_STOP", _gateway_sleeps(0.07)),
+    Way("F13", "gateway sleeps for 500 ms, robots have let go", "F13", "STANDBY", _gateway_sleeps(0.5)),
     Way("F17", "telemetry flooded", "F17 telemetry", "ENGAGED", _flood("telemetry"), _no_flood, 1.0),
     Way("F17", "junk on the control sockets", "F17 telemetry", "ENGAGED", _flood("sockets"), _no_flood, 1.0),
     Way("E3", "driver overrides", "E3", "STANDBY", _overridden, _car_heals(override=0, override_of=[])),
