@@ -9,6 +9,8 @@ import ctypes
 import errno
 import socket
 import struct
+from collections.abc import Iterator
+from itertools import islice
 from typing import Protocol, runtime_checkable
 
 import can
@@ -79,6 +81,14 @@ class Disturbable(Protocol):
 
     def disturb(self, arbitration_id: int | None, count: int) -> None:
         """Destroy the next transmissions of a message on the wire; None: of any. Replaces an earlier call for it; 0 takes back."""
+
+
+@runtime_checkable
+class Direct(Protocol):
+    """A bus that gives frames as they are: python-can's message takes longer to make than a frame to decode."""
+
+    def arrivals(self) -> Iterator[Arrival]:
+        """What has arrived and was not received yet, oldest first; it waits for nothing, and raises what `recv` does."""
 
 
 @runtime_checkable
@@ -244,14 +254,13 @@ class PythonCanPort:
             }
         # A python-can configuration file of the user's must not change what was asked for.
         self._bus = can.Bus(channel=channel, interface=interface, ignore_config=True, **settings)  # type: ignore[arg-type]
+        self._arrivals = self._bus.arrivals if isinstance(self._bus, Direct) else self._messages
 
     def receive(self) -> tuple[list[Arrival], int]:  # noqa: D102
         arrivals: list[Arrival] = []
         try:
-            for _ in range(MAX_FRAMES_PER_RECEIVE):
-                if (message := self._bus.recv(timeout=0)) is None:
-                    break
-                arrivals.append((self._identifier(message), bytes(message.data), not message.is_rx))
+            for arrival in islice(self._arrivals(), MAX_FRAMES_PER_RECEIVE):
+                arrivals.append(arrival)  # noqa: PERF402 - what came before an error counts
         except _REFUSALS as error:
             return arrivals, _number_of(error, errno.EIO)
         return arrivals, 0
@@ -294,6 +303,10 @@ class PythonCanPort:
     def close(self) -> None:  # noqa: D102
         with contextlib.suppress(*_REFUSALS):
             self._bus.shutdown()
+
+    def _messages(self) -> Iterator[Arrival]:
+        while (message := self._bus.recv(timeout=0)) is not None:
+            yield self._identifier(message), bytes(message.data), not message.is_rx
 
     def _identifier(self, message: can.Message) -> int:
         if message.is_error_frame:

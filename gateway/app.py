@@ -58,5 +58,5 @@ def run(
         arrivals = links.wait()
         pacer = Pacer(time.monotonic_ns(), TICK_NS)
         while not cycle.is_over:
-            cycle.look(arrivals.wait(pacer.deadline_ns), pacer)
+            cycle.look(arrivals.wait(pacer.deadline_ns, cycle.due_ns), pacer)
     return cycle.successor

@@ -8,13 +8,14 @@ from dbc.catalogue import NAVIGATION
 from dbc.frame import CanFrame
 from dbc.link import BusSet
 from gateway.channel import Channel, OperatorServer
+from gateway.codec import NAVIGATION_MESSAGES
 from gateway.conditions import Surroundings
 from gateway.core import StepOutput
 from gateway.ending import Ending
 from gateway.housekeeping import Notice, Orders, Pulse
 from gateway.journal import Glance, StepArguments
 from gateway.loop import ArrivalWait, CpuLoad
-from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest
+from gateway.messages import ControlCommand, Mode, Operation, OperatorReply, OperatorRequest, VehicleState
 from gateway.modes import QUIET
 from gateway.pacing import Pacer
 from gateway.preparation import Preparation
@@ -49,6 +50,7 @@ class ControlCycle:
 
     Attributes:
         is_over: whether the loop is to end.
+        due_ns: when the next navigation data are to come, which make a state [ns].
         successor: the configuration to go on with after that, None when there is none.
     """
 
@@ -67,9 +69,11 @@ class ControlCycle:
         self._ending: Ending | None = None
         self._command: ControlCommand | None = None
         self._glances: list[Glance] = []
-        self._sent_seq = 0
+        self._navigation_ns = min(preparation.catalogue.by_name[name].cycle_time_ns for name in NAVIGATION_MESSAGES)
+        self._sent_seq = self._valid_ns = 0
         self._cpu_load = CpuLoad()
         self.is_over = False
+        self.due_ns = 0
         self.successor: Preparation | None = None
 
     def look(self, now_ns: int, pacer: Pacer) -> None:
@@ -86,8 +90,7 @@ class ControlCycle:
         elif frames:
             self._glances.append(Glance(now_ns, frames))
             if (state := self._core.sense(now_ns, frames)) is not None:
-                self._links.channel.send(state)
-                self._sent_seq = state.seq
+                self._send(state, now_ns)
 
     def _step(self, now_ns: int, frames: list[CanFrame], overruns: int, cpu_start_ns: int) -> None:
         """One tick: decide, speak; then tell whoever wants to know."""
@@ -98,8 +101,7 @@ class ControlCycle:
         output = self._core.step(now_ns, frames, command, request, surroundings)
         links.buses.send(output.frames)
         if output.state.seq != self._sent_seq:
-            links.channel.send(output.state)
-            self._sent_seq = output.state.seq
+            self._send(output.state, now_ns)
         arguments = StepArguments(now_ns, frames, command, request, surroundings, glances)
         if links.recorder is not None:
             links.recorder.record(arguments, output)
@@ -110,6 +112,12 @@ class ControlCycle:
         self._tell(now_ns, output, overruns, cpu_ns)
         self._heed_orders(now_ns, output)
         self._pulse.ticks += 1
+
+    def _send(self, state: VehicleState, now_ns: int) -> None:
+        self._links.channel.send(state)
+        self._sent_seq = state.seq
+        if state.t_ns != self._valid_ns:  # made of new navigation data: the next come a cycle later
+            self._valid_ns, self.due_ns = state.t_ns, now_ns + self._navigation_ns
 
     def _surroundings(self, now_ns: int, cpu_ns: int) -> Surroundings:
         buses = self._links.buses

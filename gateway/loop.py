@@ -12,7 +12,9 @@ BUCKETS_NS = tuple(bound_us * 1_000 for bound_us in (20, 50, 100, 200, 500, 1_00
 SPACING_NS = 700_000
 """Shortest time from a wake-up to the next one for frames [ns]: 2,000 of them a second, or a flood, must not mean as many wake-ups."""
 SHORTEST_NS = 200_000
-"""Shortest time between any two wake-ups [ns]: a controller that sends without end must not take the processor."""
+"""The same for a frame that is due, and for a command after another one [ns]: who sends without end must not take the processor."""
+EARLY_NS = 300_000
+"""How much earlier or later than its cycle time says a frame that is due usually comes [ns]: the jitter of a bus and of a wake-up."""
 LONGEST_NS = 5_000_000
 """Longest sleep [ns]: what is not waited for has a time of arrival that is no more than this late."""
 
@@ -69,25 +71,35 @@ class ArrivalWait:
         self._frames = frames
         self._command = command
         self._last_ns = time.monotonic_ns()
+        self._had_command = False
 
-    def wait(self, deadline_ns: int) -> int:
-        """The monotonic time of the wake-up [ns]: `LONGEST_NS` after the one before at most, for frames `SPACING_NS` at least."""
-        deadline_ns = min(deadline_ns, self._last_ns + LONGEST_NS)
-        self._sleep([], min(self._last_ns + SHORTEST_NS, deadline_ns))
-        if not self._sleep([self._command], min(self._last_ns + SPACING_NS, deadline_ns)):
-            self._sleep([*self._frames(), self._command], deadline_ns)
+    def wait(self, deadline_ns: int, due_ns: int = 0) -> int:
+        """The monotonic time of the wake-up [ns]: `LONGEST_NS` after the one before at most, for frames `SPACING_NS` at least.
+
+        Args:
+            due_ns: when the frame comes for which all others can wait [ns]; one that has not come by then is awaited no more than others.
+        """
+        last_ns = self._last_ns
+        deadline_ns = min(deadline_ns, last_ns + LONGEST_NS)
+        spacing_ns = SHORTEST_NS if last_ns < due_ns + EARLY_NS else SPACING_NS
+        if self._had_command:
+            self._sleep([], min(last_ns + SHORTEST_NS, deadline_ns))
+        ready = self._sleep([self._command], min(max(last_ns + spacing_ns, due_ns - EARLY_NS), deadline_ns))
+        if not ready:
+            ready = self._sleep([*self._frames(), self._command], deadline_ns)
+        self._had_command = self._command in ready
         self._last_ns = time.monotonic_ns()
         return self._last_ns
 
-    def _sleep(self, descriptors: list[int], until_ns: int) -> bool:
-        """Whether something has arrived."""
+    def _sleep(self, descriptors: list[int], until_ns: int) -> list[int]:
+        """Those of the descriptors on which something has arrived; none when the time is over."""
         remaining_s = (until_ns - time.monotonic_ns()) * 1e-9
         if remaining_s <= 0.0:
-            return False
+            return []
         try:
-            return bool(select.select(descriptors, [], [], remaining_s)[0])
+            return select.select(descriptors, [], [], remaining_s)[0]
         except (OSError, ValueError):  # a bus that has just gone
-            return False
+            return []
 
 
 class PeriodicLoop:

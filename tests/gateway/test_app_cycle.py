@@ -52,6 +52,18 @@ def test_engagement_is_told_and_answered(bench):
     assert bench.pulse.ticks == len(bench.states) == sum(bench.pulse.step_cpu.counts)
 
 
+@pytest.mark.parametrize("is_step", [True, False])
+def test_navigation_data_are_due_a_cycle_after_those_before(bench, monkeypatch, is_step):
+    assert bench.cycle.due_ns == 0
+    bench.tick()
+    monkeypatch.setattr(bench.pacer, "is_due", lambda _: is_step)
+    bench.tick()
+    assert bench.cycle.due_ns == bench.now_ns + TICK_NS
+    bench.car.is_time_frozen = True
+    bench.tick(3)
+    assert bench.cycle.due_ns == bench.now_ns - 2 * TICK_NS
+
+
 @pytest.mark.req("E1")
 def test_end_in_silence_is_at_once_and_still_silent(bench):
     bench.tick(50)

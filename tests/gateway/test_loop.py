@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from gateway import loop as loop_module
-from gateway.loop import BUCKETS_NS, LONGEST_NS, SHORTEST_NS, SPACING_NS, ArrivalWait, CpuLoad, Histogram, PeriodicLoop
+from gateway.loop import BUCKETS_NS, EARLY_NS, LONGEST_NS, SHORTEST_NS, SPACING_NS, ArrivalWait, CpuLoad, Histogram, PeriodicLoop
 
 MS = 1_000_000
 
@@ -107,6 +107,7 @@ def test_histogram_takes_no_memory_while_it_counts():
 
 
 FRAMES, COMMAND = 3, 4
+DUE_NS = 3 * MS
 
 
 @pytest.fixture
@@ -134,13 +135,46 @@ def arrivals_ns(clock, monkeypatch):
         ({COMMAND: 1 * MS}, 2 * MS, 1 * MS),
         ({FRAMES: 300_000}, 2 * MS, SPACING_NS),  # frames wait for each other
         ({COMMAND: 300_000}, 2 * MS, 300_000),  # a command for nobody
-        ({COMMAND: 0}, 2 * MS, SHORTEST_NS),
+        ({COMMAND: 0}, 2 * MS, 0),
     ],
 )
 def test_it_wakes_up_when_something_is_there_and_at_the_deadline_at_the_latest(clock, arrivals_ns, arrival, deadline_ns, woken_ns):
     arrivals, start_ns = ArrivalWait(lambda: [FRAMES], COMMAND), clock.now_ns
     arrivals_ns |= {descriptor: start_ns + after_ns for descriptor, after_ns in arrival.items()}
     assert arrivals.wait(start_ns + deadline_ns) == start_ns + woken_ns
+
+
+@pytest.mark.parametrize(
+    ("arrival", "deadline_ns", "woken_ns"),
+    [
+        ({FRAMES: 1 * MS}, 4 * MS, DUE_NS - EARLY_NS),  # those before it wait for the one that is due
+        ({FRAMES: DUE_NS - 10_000}, 4 * MS, DUE_NS - 10_000),
+        ({FRAMES: DUE_NS + 2 * EARLY_NS}, 4 * MS, DUE_NS + 2 * EARLY_NS),
+        ({FRAMES: 1 * MS}, 2 * MS, 2 * MS),
+        ({FRAMES: 1 * MS, COMMAND: 2 * MS}, 4 * MS, 2 * MS),
+    ],
+)
+def test_until_shortly_before_a_frame_is_due_it_sleeps(clock, arrivals_ns, arrival, deadline_ns, woken_ns):
+    arrivals, start_ns = ArrivalWait(lambda: [FRAMES], COMMAND), clock.now_ns
+    arrivals_ns |= {descriptor: start_ns + after_ns for descriptor, after_ns in arrival.items()}
+    assert arrivals.wait(start_ns + deadline_ns, start_ns + DUE_NS) == start_ns + woken_ns
+
+
+def test_only_about_the_time_when_it_is_due_it_looks_often(clock, arrivals_ns):
+    arrivals, start_ns = ArrivalWait(lambda: [FRAMES], COMMAND), clock.now_ns
+    arrivals_ns[FRAMES] = start_ns  # others come without end, and it does not
+    wakes_ns = [arrivals.wait(start_ns + 60_000 * MS, start_ns + DUE_NS) for _ in range(8)]
+    spacings_ns = [after - before for before, after in pairwise(wakes_ns)]
+    assert wakes_ns[0] == start_ns + DUE_NS - EARLY_NS
+    often = [before for before, spacing_ns in zip(wakes_ns, spacings_ns, strict=False) if spacing_ns == SHORTEST_NS]
+    assert often == [one for one in wakes_ns if one < start_ns + DUE_NS + EARLY_NS]
+    assert set(spacings_ns) == {SHORTEST_NS, SPACING_NS}
+
+
+def test_a_command_after_another_waits_a_little(clock, arrivals_ns):
+    arrivals, start_ns = ArrivalWait(lambda: [FRAMES], COMMAND), clock.now_ns
+    arrivals_ns[COMMAND] = start_ns  # nobody reads: it stays readable
+    assert [arrivals.wait(start_ns + 60_000 * MS) - start_ns for _ in range(3)] == [0, SHORTEST_NS, 2 * SHORTEST_NS]
 
 
 def test_it_wakes_up_for_frames_or_at_the_deadline_and_not_too_often():

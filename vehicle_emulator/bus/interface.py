@@ -4,12 +4,15 @@ It behaves as SocketCAN does: a node does not hear itself unless it asks to, `se
 no more, and error frames tell what fault confinement makes of the node. The bit rate is the hub's.
 """
 
+import contextlib
 import select
 import time
+from collections.abc import Iterator
 
 import can
 from can.typechecking import CanFilter, CanFilters
 
+from dbc.can_io import ERROR_FLAG, EXTENDED_FLAG, Arrival
 from vehicle_emulator.bus import error_frames, wire
 from vehicle_emulator.bus.channel import BusError, address_of, open_socket
 from vehicle_emulator.bus.confinement import ErrorState
@@ -109,27 +112,61 @@ class XilgateBus(can.BusABC):
         self._named_ids = wire.named_ids(settings.filters or ())
         self._transfer(wire.pack_control(settings), _JOIN_TIMEOUT_S)
 
+    def arrivals(self) -> Iterator[Arrival]:
+        """Frames that have arrived, as `dbc.can_io` counts them: what `recv` says without a wait, in a fraction of its time.
+
+        Raises:
+            can.CanOperationError: the hub has gone.
+        """
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                frame, t_ns, is_own = self._next()
+                if self._is_asked_for(frame) or self._matches_filters(self._message(frame, t_ns, is_own)):
+                    yield _identifier(frame), frame.data, is_own
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         try:
-            self._connection.flush()
-            packet = self._connection.receive()
+            frame, t_ns, is_own = self._next()
         except BlockingIOError:
             if not self._wait(select.POLLIN, timeout):
                 return None, False
             # Without a wait this time: another thread may have taken the frame, and the caller keeps count of its time.
             return self._recv_internal(0.0)
+        return self._message(frame, t_ns, is_own), self._is_asked_for(frame)
+
+    def _next(self) -> tuple[BusFrame, int, bool]:
+        """The next frame that has arrived, its time [ns], and whether it is our own.
+
+        Raises:
+            BlockingIOError: none has.
+            can.CanOperationError: the hub has gone.
+        """
+        try:
+            self._connection.flush()
+            while not isinstance(content := wire.unpack(self._packet()), tuple):
+                pass  # the hub says nothing but frames to a node that has joined
+        except BlockingIOError:
+            raise
         except (OSError, wire.WireError) as error:
             raise can.CanOperationError(f"{self.channel_info}: {error}") from error
-        if not packet:
-            raise can.CanOperationError(f"{self.channel_info}: the hub has gone")
-        content = wire.unpack(packet)
-        # The hub says nothing but frames to a node that has joined. Filters are applied again, for frames that were on their way
-        # when they were changed, but for those that a filter names; error frames pass whatever they are, as with SocketCAN.
-        if not isinstance(content, tuple):
-            return None, False
         frame = content[0]
+        if frame.flags & ERROR and (state := error_frames.state_in(frame)) is not None:
+            self._error_state = state
+        return content
+
+    def _packet(self) -> bytes:
+        if not (packet := self._connection.receive()):
+            raise can.CanOperationError(f"{self.channel_info}: the hub has gone")
+        return packet
+
+    def _is_asked_for(self, frame: BusFrame) -> bool:
+        """Whether a frame is surely one that the filters let pass.
+
+        They are applied again, for frames that were on their way when they were changed, but for those that a filter names; error
+        frames pass whatever they are, as with SocketCAN.
+        """
         is_named = frame.arbitration_id in self._named_ids and not frame.flags & EXTENDED
-        return self._message(*content), is_named or bool(frame.flags & ERROR)
+        return is_named or bool(frame.flags & ERROR)
 
     def send(self, msg: can.Message, timeout: float | None = None) -> None:
         """Hand a frame to the bus.
@@ -143,7 +180,7 @@ class XilgateBus(can.BusABC):
         """
         if self._error_state is ErrorState.BUS_OFF:
             raise can.CanOperationError(f"{self.channel_info}: bus-off")
-        self._transfer(self._packet(msg), timeout or 0.0)
+        self._transfer(self._packed(msg), timeout or 0.0)
 
     def shutdown(self) -> None:
         """Leave the bus; can be called again."""
@@ -171,7 +208,7 @@ class XilgateBus(can.BusABC):
         poll.register(self._connection.fileno(), event)
         return bool(poll.poll(None if timeout_s is None else timeout_s * 1000.0))
 
-    def _packet(self, msg: can.Message) -> bytes:
+    def _packed(self, msg: can.Message) -> bytes:
         if msg.is_error_frame:
             raise can.CanOperationError(f"{self.channel_info}: an error frame cannot be sent; `disturb` makes errors")
         if msg.is_fd and self._can_protocol is not can.CanProtocol.CAN_FD:
@@ -186,8 +223,6 @@ class XilgateBus(can.BusABC):
 
     def _message(self, frame: BusFrame, t_ns: int, is_own: bool) -> can.Message:
         flags = frame.flags
-        if flags & ERROR and (state := error_frames.state_in(frame)) is not None:
-            self._error_state = state
         return can.Message(
             timestamp=t_ns * 1e-9,
             arbitration_id=frame.arbitration_id,
@@ -202,6 +237,13 @@ class XilgateBus(can.BusABC):
             dlc=frame.length_bytes,
             data=frame.data,
         )
+
+
+def _identifier(frame: BusFrame) -> int:
+    """With the flags of linux/can.h; that of an extended one stands for all that is no classical data frame with 11 bits."""
+    if not frame.flags:
+        return frame.arbitration_id
+    return (ERROR_FLAG if frame.flags & ERROR else EXTENDED_FLAG) | frame.arbitration_id
 
 
 def _wire_filters(filters: CanFilters | None) -> tuple[wire.Filter, ...] | None:

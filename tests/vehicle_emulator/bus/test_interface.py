@@ -1,6 +1,7 @@
 """The python-can interface: every kind of frame, filters, time stamps, and what its user sees when something is wrong."""
 
 import asyncio
+import select
 import threading
 import time
 from itertools import pairwise
@@ -8,6 +9,8 @@ from itertools import pairwise
 import can
 import pytest
 
+from dbc.can_io import EXTENDED_FLAG, Direct
+from tests.support.processes import wait_until
 from tests.vehicle_emulator.bus.conftest import serving
 from vehicle_emulator.bus.bits import frame_bits
 from vehicle_emulator.bus.frame import BusFrame
@@ -81,6 +84,43 @@ def test_impossible_frames_are_refused_before_they_are_sent(pair, message, cause
 def test_fd_frame_needs_a_bus_opened_for_it(pair):
     with pytest.raises(can.CanOperationError, match="opened without fd=True"):
         pair[1].send(MESSAGES["fd"])
+
+
+def test_arrivals_are_what_recv_says(pair, channel):
+    a, b = pair
+    with can.Bus(interface="xilgate", channel=channel, receive_own_messages=True) as c:
+        for message in MESSAGES.values():
+            a.send(message)
+        c.send(standard(0x300, b"own"))
+        said, heard = [receive(b) for _ in range(len(MESSAGES) + 1)], []
+        assert isinstance(c, Direct)
+        wait_until(lambda: heard.extend(c.arrivals()) or len(heard) == len(said), PATIENCE_S, "all frames")
+    unlike = {one.arbitration_id for one in said if one.is_extended_id or one.is_remote_frame or one.is_fd}
+    expected = [(one.arbitration_id | EXTENDED_FLAG * (one.arbitration_id in unlike), bytes(one.data)) for one in said]
+    assert [one[:2] for one in heard] == expected
+    assert [identifier for identifier, _, is_own in heard if is_own] == [0x300]
+
+
+def test_arrivals_pass_filters(hub, channel):
+    filters = [{"can_id": 0x100, "can_mask": 0x700, "extended": False}]
+    with can.Bus(interface="xilgate", channel=channel) as a, can.Bus(interface="xilgate", channel=channel, can_filters=filters) as b:
+        for arbitration_id in (0x100, 0x200, 0x1FF):
+            a.send(standard(arbitration_id))
+        heard = []
+        wait_until(lambda: heard.extend(b.arrivals()) or len(heard) == 2, PATIENCE_S, "two frames")
+    assert [identifier for identifier, _, _ in heard] == [0x100, 0x1FF]
+
+
+def test_what_came_before_the_hub_went_arrives():
+    with serving("bus1"), XilgateBus("bus1") as a:
+        b = XilgateBus("bus1")
+        a.send(standard(0x100))
+        select.select([b.fileno()], [], [], PATIENCE_S)
+    with b:
+        arrivals = b.arrivals()
+        assert next(arrivals) == (0x100, b"", False)
+        with pytest.raises(can.CanOperationError, match="the hub has gone"):
+            next(arrivals)
 
 
 def test_filters(pair):
