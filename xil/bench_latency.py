@@ -2,8 +2,9 @@
 
 Real processes: a hub with two emulated buses, and the gateway with its recorder. The bench plays a standing car, ready to be
 driven, from frames that were made beforehand, and a controller that answers every fourth state after the time that a solve takes.
-Both times are taken by one clock: of a frame from its end on the bus as another node hears it, of a command from its sending to the
-end of the first frame that answers it, its 0.25 ms on the wire included.
+Both times are taken by one clock: from the end of the frame with which navigation data are complete to the state that is made of them,
+and from the sending of a command to the end of the first frame that answers it, its 0.25 ms on the wire included. The hub says when
+a frame ended on the wire; how soon the bench hears of it does not count.
 """
 
 import os
@@ -11,11 +12,12 @@ import select
 import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
 from rich.table import Table
 
@@ -132,7 +134,9 @@ class _Bench:
         self._time_id = catalogue.by_name["MilliTime"].arbitration_id
         self._safety = catalogue.by_name["GW_SafetyCommand"]
         self._times = _Times()
-        self._heard_ns = 0
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._end_ns = 0
+        self._valid_ns = 0
         self._sent_ns = 0
         self._answer: tuple[int, int] | None = None
         self._measurement_id = -1.0
@@ -146,8 +150,8 @@ class _Bench:
         sender.start()
         try:
             with (
-                CanLink(self._buses[ROBOTS]) as robots,
-                CanLink(self._buses[NAVIGATION]) as navigation,
+                _opened(self._buses[ROBOTS]) as robots,
+                _opened(self._buses[NAVIGATION]) as navigation,
                 Channel(self._control.controller_socket, self._control.gateway_socket, self._control.key()) as channel,
             ):
                 self._get_ready(robots, navigation, channel)
@@ -172,7 +176,7 @@ class _Bench:
                     time.sleep(wait_ns * 1e-9)
                 links[self._catalogue.by_id[frame.arbitration_id].network].send([frame])
 
-    def _get_ready(self, robots: CanLink, navigation: CanLink, channel: Channel) -> None:
+    def _get_ready(self, robots: can.BusABC, navigation: can.BusABC, channel: Channel) -> None:
         deadline_s = time.monotonic() + _TIMEOUT_S
         with operator_client(self._control) as operator:
             while (reply := operator.ask(Operation.ARM)).mode is not Mode.READY:
@@ -180,28 +184,34 @@ class _Bench:
                     raise SetupFailure("the gateway refuses: " + ", ".join(reply.refusals))
                 self._listen(robots, navigation, channel, _ASK_S)
 
-    def _listen(self, robots: CanLink, navigation: CanLink, channel: Channel, seconds: float) -> None:
-        end_ns = time.monotonic_ns() + round(seconds * 1e9)
-        while (now_ns := time.monotonic_ns()) < end_ns:
-            due_ns = end_ns if self._answer is None else min(end_ns, self._answer[0])
+    def _listen(self, robots: can.BusABC, navigation: can.BusABC, channel: Channel, seconds: float) -> None:
+        stop_ns = time.monotonic_ns() + round(seconds * 1e9)
+        while (now_ns := time.monotonic_ns()) < stop_ns:
+            due_ns = stop_ns if self._answer is None else min(stop_ns, self._answer[0])
             select.select([robots.fileno(), navigation.fileno(), channel.fileno()], [], [], max(due_ns - now_ns, 0) * 1e-9)
-            for frame in navigation.receive():
-                if frame.arbitration_id == self._time_id:
-                    self._heard_ns = frame.t_ns
-            self._hear_robots(robots.receive())
-            if (state := channel.newest(VehicleState)) is not None:
-                self._note_state(state)
+            state, heard_ns = channel.newest(VehicleState), time.monotonic_ns()
+            # Whatever the state is made of is there by now.
+            for message, end_ns in self._messages(navigation):
+                if message.arbitration_id == self._time_id:
+                    self._end_ns = end_ns
+            self._hear_robots(robots)
+            if state is not None:
+                self._note_state(state, heard_ns)
             if self._answer is not None and time.monotonic_ns() >= self._answer[0]:
                 self._command(channel, self._answer[1])
 
-    def _note_state(self, state: VehicleState) -> None:
-        now_ns = time.monotonic_ns()
-        if self._is_measuring and self._heard_ns:
-            self._times.frame_to_state.append(now_ns - self._heard_ns)
-        self._heard_ns = 0
+    def _messages(self, bus: can.BusABC) -> Iterator[tuple[can.Message, int]]:
+        """What has arrived, each with its end on the wire [ns]."""
+        while (message := bus.recv(timeout=0)) is not None:
+            yield message, round(message.timestamp * 1e9) - self._epoch_ns
+
+    def _note_state(self, state: VehicleState, heard_ns: int) -> None:
+        if state.t_ns != self._valid_ns and self._is_measuring:  # made of new navigation data
+            self._times.frame_to_state.append(heard_ns - self._end_ns)
+        self._valid_ns = state.t_ns
         self._states += 1
         if self._states % STATES_PER_COMMAND == 0:
-            self._answer = now_ns + round(SOLVE_S * 1e9), state.seq
+            self._answer = heard_ns + round(SOLVE_S * 1e9), state.seq
 
     def _command(self, channel: Channel, state_seq: int) -> None:
         plan = (0.0,) * HORIZON_STEPS
@@ -209,14 +219,20 @@ class _Bench:
         channel.send(ControlCommand(1, self._states, state_seq, now_ns, CommandStatus.OK, 0, 0.0, 0.0, 0.0, 0.0, plan, plan))
         self._answer, self._sent_ns = None, now_ns
 
-    def _hear_robots(self, frames: list[CanFrame]) -> None:
-        for frame in frames:
-            if frame.arbitration_id != self._safety.arbitration_id:
+    def _hear_robots(self, robots: can.BusABC) -> None:
+        for message, end_ns in self._messages(robots):
+            if message.arbitration_id != self._safety.arbitration_id:
                 continue
+            frame = CanFrame(message.arbitration_id, bytes(message.data), end_ns)
             measurement_id = self._catalogue.decode(self._safety, frame)["MeasurementId"]
             if measurement_id != self._measurement_id and self._is_measuring:
-                self._times.command_to_frame.append(frame.t_ns - self._sent_ns)
+                self._times.command_to_frame.append(end_ns - self._sent_ns)
             self._measurement_id = measurement_id
+
+
+def _opened(bus_name: str) -> can.BusABC:
+    interface, channel = bus_name.split(":")
+    return can.Bus(interface=interface, channel=channel, ignore_config=True)
 
 
 def _cpu_s(pid: int) -> float:
