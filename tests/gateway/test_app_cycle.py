@@ -387,3 +387,17 @@ def test_the_process_is_made_of_what_the_rig_file_says(tmp_path, monkeypatch):
     assert given["Publisher"] == (Source.GATEWAY, 7000, preparation.rig.telemetry.tls)
     assert given["warm_up"] == (preparation,)
     assert given["realtime_practice"] == (preparation.rig.realtime,)
+
+
+def test_the_loop_sleeps_until_navigation_data_are_due(tmp_path, monkeypatch):
+    asked_ns = []
+    cycle = SimpleNamespace(is_over=False, successor=None, due_ns=17)
+    cycle.look = lambda *_: setattr(cycle, "is_over", True)
+    monkeypatch.setattr(app, "ControlCycle", lambda *_: cycle)
+    monkeypatch.setattr(app, "warm_up", lambda _: None)
+    monkeypatch.setattr(app, "Publisher", lambda *_: contextlib.nullcontext(SimpleNamespace(post=lambda _: None, dropped=0)))
+    monkeypatch.setattr(app, "realtime_practice", lambda *_: contextlib.nullcontext({}))
+    monkeypatch.setattr(Links, "wait", lambda _: SimpleNamespace(wait=lambda _, due_ns: asked_ns.append(due_ns)))
+    preparation = prepare(make_rig(Path("test"), TREE | {"control": {"directory": str(tmp_path)}}, Path("/")))
+    assert app.run(preparation, Orders(), Notifier({}), None) is None
+    assert asked_ns == [17]
