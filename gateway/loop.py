@@ -76,6 +76,8 @@ class ArrivalWait:
     def wait(self, deadline_ns: int, due_ns: int = 0) -> int:
         """The monotonic time of the wake-up [ns]: `LONGEST_NS` after the one before at most, for frames `SPACING_NS` at least.
 
+        About the time when a frame is due, `SHORTEST_NS` are enough.
+
         Args:
             due_ns: when the frame comes for which all others can wait [ns]; one that has not come by then is awaited no more than others.
         """

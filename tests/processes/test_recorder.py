@@ -18,7 +18,8 @@ TRIALS = 30
 DISK_BYTES = 64 << 20
 ON_A_SMALL_DISK = f'mount -t tmpfs -o size={DISK_BYTES} tmpfs "$0" && exec "$@"'
 MAX_GROWTH_S = 0.0005  # B3, F15: p99 of the ticks
-UNDISTURBED_S = 1.0
+MAX_USUAL_S = 0.001  # a machine that is later than that by itself says nothing about growth
+WATCHED_S = 5.0
 
 
 @pytest.fixture(scope="module")
@@ -76,12 +77,13 @@ def test_ticks_are_as_punctual_and_nobody_engages_again(rig, way, figure):
     rig.restart_gateway()
     rig.engage()
     before = rig.buckets("tick_lateness_seconds")
-    time.sleep(UNDISTURBED_S)
+    time.sleep(WATCHED_S)
     between = rig.buckets("tick_lateness_seconds")
     way.inject(rig, None)
-    time.sleep(5 * UNDISTURBED_S)
+    time.sleep(WATCHED_S)
     after = rig.buckets("tick_lateness_seconds")
     usual_s, now_s = percentile_s(before, between, 0.99), percentile_s(between, after, 0.99)
+    assert usual_s <= MAX_USUAL_S, "inconclusive"
     assert figure(f"{way}: growth of the tick lateness, p99", (now_s - usual_s) * 1e3, "ms", f"<= {MAX_GROWTH_S * 1e3:g}")
     assert rig.mode == "ENGAGED"
     rig.release()
